@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import control as ct
 import numpy as np
+import pytest
 
 import ctrlid as cid
 import problems
@@ -76,6 +77,7 @@ def test_an_error_of_the_reading_shows_as_one():
 def test_what_parameters_take_up_says_nothing():
     nothing = np.zeros(3), np.zeros((3, 3)), np.ones(3)
     assert compute_score_probability(*nothing) == 1.0
+    assert compute_score_probability(np.full(3, np.nan), *nothing[1:]) == 1.0
     # A shape of which a millionth of a millionth is left has no freedom of its own.
     score, left = np.array([1.0, 1e-3]), np.diag([1.0, 1e-12])
     p = compute_score_probability(score, left, np.ones(2))
@@ -97,6 +99,33 @@ def test_forces_and_readings_of_several_signals_are_told_apart():
     p = seen_in(loop, replace(record, y=alpha))
     assert min(shapes, key=p.get) == "reading of theta by x"
     assert p["reading of theta by x"] < 1e-6
+
+
+def chain(t, x, u, p):
+    spring = 5.0 * (x[2] - x[0])
+    return np.array([x[1], u[0] - p["k"] * x[0] - x[1] + spring, x[3], -spring - 2.0 * x[3]])
+
+
+def tanks(t, x, u, p):
+    return np.array([u[0] - p["k"] * x[0], x[0] - 0.5 * x[1], 0.5 * x[1] - 0.7 * x[2]])
+
+
+@pytest.mark.parametrize(
+    ("rates", "states", "kinds"),
+    [(chain, ("x1", "v1", "x2", "v2"), {"force", "slope", "reading"}),
+     (tanks, ("h1", "h2", "h3"), {"force at h1", "force at h2", "force at h3", "slope at h1",
+                                  "slope at h2", "slope at h3", "reading"})],
+)  # fmt: skip
+def test_one_output_of_several_masses_or_tanks(rates, states, kinds):
+    """One force acts on all velocities of a plant with one output, and one on each level."""
+    plant = ct.nlsys(rates, lambda t, x, u, p: x[2], inputs=["u"], outputs=["y"], states=states,
+                     params={"k": 1.0}, name="plant")  # fmt: skip
+    loop = cid.Loop(plant, dt=0.05, free=("k",))
+    d = cid.random_binary(1500, amplitude=1.0, hold=30, seed=1)
+    p = seen_in(loop, cid.simulate(loop, d=d, sensor_noise=1e-3, seed=2))
+    shapes = [k for k in p if k.startswith(("force", "slope", "reading"))]
+    assert {k.partition(" by ")[0] for k in shapes} == kinds
+    assert min(p[k] for k in shapes) > 1e-4
 
 
 def test_a_quantity_counts_where_it_moves_in_one_record_of_several():

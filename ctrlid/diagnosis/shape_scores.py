@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
@@ -171,6 +172,8 @@ def run_shape_tests(fit: Fit, axes: Sequence[Mapping[str, Array]]) -> dict[str, 
     """
     if not fit.linearized:
         fit = relinearize_fit(fit)
+        if not math.isfinite(fit.value):
+            return {}  # The filter lost the record on its way back along it.
     # What counts of any output.
     seen = [keep if keep.ndim == 1 else keep.any(axis=1) for keep in fit.counts]
     p_values = {}
@@ -205,6 +208,8 @@ def run_shape_tests(fit: Fit, axes: Sequence[Mapping[str, Array]]) -> dict[str, 
 def _list_kinds(fit: Fit, bins: Sequence[Array]) -> dict[str, list[Columns]]:
     """Return what the bins do in each record, by the kind of what depends on the quantity."""
     outputs, forces = name_noise_places(fit.plant.loop)
+    if fit.plant.channels == 1:
+        forces = ("",)  # One force acts on all velocities of a plant with one output.
     inputs = fit.plant.e.inputs
     kinds: dict[str, list[Columns]] = {}
     for data, lin, chosen in zip(fit.data, fit.linearized, bins, strict=True):
@@ -243,10 +248,12 @@ def compute_score_probability(score: Array, information: Array, alone: Array) ->
     alone : ndarray, shape (shapes,)
         The variances if no parameter were fitted.
     """
+    if not (np.isfinite(score).all() and np.isfinite(information).all()):
+        return 1.0
     size = np.sqrt(np.maximum(alone, THRESHOLD.tiny))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     use = values > THRESHOLD.seen
-    if not use.any() or not np.isfinite(score).all():
+    if not use.any():
         return 1.0
     along = vectors[:, use].T @ (score / size)
     return float(stats.chi2.sf(float(np.sum(along**2 / values[use])), int(use.sum())))
