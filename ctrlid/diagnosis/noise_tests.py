@@ -28,13 +28,11 @@ from .constancy import (
     run_constancy_tests,
     sum_in_bins,
 )
-from .shape_scores import run_shape_tests
+from .shape_scores import Axes, run_shape_tests
 from .thresholds import THRESHOLD
 
 # The tests of heavy tails.
 TAILS = "heavy tails", "isolated events"
-# For each record the quantities in whose bins errors are looked at, by name, at all its samples.
-Axes = Sequence[Mapping[str, Array]]
 # The test of whether large errors come one by one.
 SIZES = "independence of sizes"
 

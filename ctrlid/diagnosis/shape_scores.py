@@ -22,6 +22,8 @@ from .thresholds import THRESHOLD
 
 # How the columns of a shape enter the filter: the derivatives of a record's states and outputs.
 Columns = tuple[Array, Array]
+# For each record the quantities in whose bins errors are looked at, by name, at all its samples.
+Axes = Sequence[Mapping[str, Array]]
 
 
 def score_shapes(
@@ -125,23 +127,28 @@ def _place_columns(
     plant: SampledPlant, lin: Linearized, shape: Array, parameter: str | None, place: str, at: str
 ) -> Columns:
     """Return what shapes do as a force, as an error of the reading, or by a parameter."""
-    states = np.zeros((*lin.dp.shape[:2], shape.shape[1]))
-    outputs = np.zeros((*lin.output.shape, shape.shape[1]))
     if place == "output":
-        seen = (slice(None), plant.e.outputs.index(at)) if at else slice(None)
-        outputs[seen] = shape
-    else:
-        if parameter is not None:
-            by = lin.dp[:, :, plant.names.index(parameter)]
-        elif at:
-            by = lin.b[:, :, find_force_channel(plant.e, at)]
-        else:
-            by = lin.b.sum(axis=2)
-        np.multiply(by[:, :, None], shape[:, None], out=states)
-    return states, outputs
+        return _add_to_reading(lin, shape, plant.e.outputs.index(at) if at else 0)
+    if parameter is not None:
+        return _push(lin, lin.dp[:, :, plant.names.index(parameter)], shape)
+    if at:
+        return _push(lin, lin.b[:, :, find_force_channel(plant.e, at)], shape)
+    return _push(lin, lin.b.sum(axis=2), shape)
 
 
-def run_shape_tests(fit: Fit, axes: Sequence[Mapping[str, Array]]) -> dict[str, float]:
+def _push(lin: Linearized, by: Array, shape: Array) -> Columns:
+    """Return what shapes do that move the states by so much in each period, (n, states)."""
+    return by[:, :, None] * shape[:, None], np.zeros((*lin.output.shape, shape.shape[1]))
+
+
+def _add_to_reading(lin: Linearized, shape: Array, output: int) -> Columns:
+    """Return what shapes do that are added to the reading of an output."""
+    read = np.zeros((*lin.output.shape, shape.shape[1]))
+    read[(slice(None), output) if lin.output.ndim == 2 else ...] = shape
+    return np.zeros((*lin.dp.shape[:2], shape.shape[1])), read
+
+
+def run_shape_tests(fit: Fit, axes: Axes) -> dict[str, float]:
     r"""Test that no force, no slope of the input and no error of the reading depends on anything.
 
     With the score g and the information H of `score_shapes`, of a force that is one in one bin of a
@@ -213,24 +220,17 @@ def _list_kinds(fit: Fit, bins: Sequence[Array]) -> dict[str, list[Columns]]:
     inputs = fit.plant.e.inputs
     kinds: dict[str, list[Columns]] = {}
     for data, lin, chosen in zip(fit.data, fit.linearized, bins, strict=True):
-        nothing = np.zeros((*lin.output.shape, chosen.shape[1]))
         u = np.reshape(data.u, (len(data.u), -1))
         away = u - np.mean(u[np.reshape(data.valid, (len(data.valid), -1)).all(axis=1)], axis=0)
         for j, name in enumerate(forces):
-            pushed = lin.b[:, :, j, None]
-            place = f" at {name}" if len(forces) > 1 else ""
-            one = pushed * chosen[:, None], nothing
-            kinds.setdefault(f"force{place}", []).append(one)
+            by, place = lin.b[:, :, j], f" at {name}" if len(forces) > 1 else ""
+            kinds.setdefault(f"force{place}", []).append(_push(lin, by, chosen))
             for i, entry in enumerate(inputs):
-                sloped = pushed * (chosen * away[:, i, None])[:, None], nothing
-                of = f" of {entry}" if len(inputs) > 1 else ""
-                kinds.setdefault(f"slope{of}{place}", []).append(sloped)
-        still = np.zeros((*lin.dp.shape[:2], chosen.shape[1]))
+                of, sloped = f" of {entry}" if len(inputs) > 1 else "", chosen * away[:, [i]]
+                kinds.setdefault(f"slope{of}{place}", []).append(_push(lin, by, sloped))
         for k, name in enumerate(outputs):
-            read = nothing.copy()
-            read[(slice(None), k) if lin.output.ndim == 2 else ...] = chosen
             of = f" of {name}" if len(outputs) > 1 else ""
-            kinds.setdefault(f"reading{of}", []).append((still, read))
+            kinds.setdefault(f"reading{of}", []).append(_add_to_reading(lin, chosen, k))
     return kinds
 
 
