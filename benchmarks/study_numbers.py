@@ -18,6 +18,7 @@ from typing import Any
 import joblib
 import numpy as np
 import study_frozen as study
+from _shares import append_line
 from watched_numbers import LEFT, change_number, list_judged_numbers
 
 from ctrlid.diagnosis.thresholds import vary_numbers
@@ -113,7 +114,7 @@ def main() -> None:
         ]
         work = joblib.Parallel(n_jobs=options.jobs, return_as="generator_unordered")
         for line in work(joblib.delayed(run)(*task) for task in tasks):
-            study.append(options.out, line)
+            append_line(options.out, line)
             print(line["number"], line["factor"], *study.make_key(line), flush=True)
         done = study.read(options.out, study.make_changed_key)
         if Path(options.out).exists():

@@ -994,6 +994,24 @@ def test_effects_at_one_place_end_in_the_order_in_which_they_act(order):
         assert names == [type(hidden[k]).__name__ for k in order]
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["zone behind", "zone before"])
+def test_a_dead_zone_ends_on_its_side_of_a_backlash(order):
+    loop, real = drive(), drive()
+    hidden = E.InputDeadZone(0.3), E.InputBacklash(0.2)
+    for k in order:
+        real = real.with_effect(hidden[k])
+    record = problems.record_of(real, swing=0.3, hold=60, n=2000, seed=9970, sensor_noise=1e-4)
+    for found in (hidden, hidden[::-1]):
+        both = loop.with_effect(found[0]).with_effect(found[1])
+        own = ("InputDeadZone.width", "InputBacklash.width")
+        model = fit_base_model(both, [record], (*loop.free, *own))
+        fitted = order_last_effect(model, given=0).fitted
+        names = [type(e).__name__ for e in fitted.effects]
+        assert names == [type(hidden[k]).__name__ for k in order]
+        assert fitted.labelled["InputDeadZone"].width == pytest.approx(0.3, abs=0.01)
+        assert fitted.labelled["InputBacklash"].width == pytest.approx(0.2, abs=0.01)
+
+
 @pytest.mark.parametrize("seed", [9950, 9960])
 @pytest.mark.slow
 def test_a_lag_behind_a_curve_of_the_input_is_not_taken_for_one_of_the_sensor(seed):
@@ -1035,6 +1053,18 @@ def test_an_order_that_makes_no_difference_is_kept():
     one = fit_base_model(loop.with_effect(E.InputOffset(0.1)), [record], loop.free)
     two = refit_candidate(one, screen_at(one, E.InputDeadZone(0.01))).model
     assert order_last_effect(two, given=1) is two  # whose place the user knows
+
+
+def test_a_line_that_leaves_nothing_to_be_seen_is_no_stand_in():
+    """A test of whiteness counts it once for each lag, and says more than it gains."""
+    loop = drive()
+    real = loop.with_effect(E.SensorHum(amplitude=8e-5, frequency=11.0, phase=0.4))
+    record = problems.record_of(real, swing=0.3, hold=60, n=2000, seed=9430, sensor_noise=1e-4)
+    model = with_linearization(fit_base_model(loop, [record], loop.free))
+    start = E.SensorHum(amplitude=7e-5, frequency=11.0, phase=0.3)
+    hum = refit_candidate(model, screen_candidate(model, start))
+    assert hum.gain < THRESHOLD.small_gain * run_noise_tests(model.fit).evidence
+    assert not _is_stand_in(hum, model, beside=True)
 
 
 def test_models_are_compared_on_the_samples_that_all_of_them_reach():

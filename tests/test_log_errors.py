@@ -5,12 +5,14 @@ The rig is simulated here, in numpy: a stick that stands on its pivot, J th" = m
 """
 
 import math
+from dataclasses import replace
 
 import control as ct
 import numpy as np
 import pytest
 
 import ctrlid as cid
+from ctrlid.diagnosis.log_errors import Log, _measure, _scale, find_log_error
 
 MASS, LENGTH, GRAVITY, DT = 0.35, 0.40, 9.81, 0.005
 INERTIA = MASS * LENGTH**2
@@ -142,3 +144,24 @@ def test_an_output_that_does_not_move_is_the_headline():
     found = cid.diagnose(loop, cid.Record(u=u, y=y, dt=dt), catalogue=small, progress=False)
     assert found.sentence.startswith("THE OUTPUT DOES NOT SEEM TO MOVE"), found.sentence
     assert (found.verdict, found.findings, found.stand_ins) == ("unknown", (), ())
+
+
+def test_a_repair_after_which_the_input_does_nothing_is_none():
+    """A random force explains any record that wanders, in any unit."""
+    rng = np.random.default_rng(12)
+    u = cid.random_binary(900, amplitude=1.0, hold=20, seed=13)
+    y = np.cumsum(rng.standard_normal(900)) * 1e-3 + 1e-4 * rng.standard_normal(900)
+    plant = ct.nlsys(lambda t, x, u, p: [-0.05 * x[0] + u[0]], lambda t, x, u, p: [x[0]],
+                     states=["h"], inputs=["q"], outputs=["h"], name="tank")  # fmt: skip
+    loop = cid.Loop(plant, None, dt=0.1)
+    record = cid.Record(u=u, y=y, dt=0.1)
+    log = Log(loop, [record], (), -1e9)
+    moved = _measure(loop, [_scale(record, 1e-3, 1.0)], None)
+    assert moved > log.least  # so that a thousandth of the input looks like a mend
+    assert find_log_error(log) is None
+    # Where the input moves the plant, the same log has an error that is found.
+    driven = cid.simulate(loop, d=u, sensor_noise=1e-3, seed=14)
+    wrong = replace(driven, u=1e3 * np.asarray(driven.u))
+    found = find_log_error(Log(loop, [wrong], (), -1e9))
+    assert found is not None
+    assert "u is a thousand times too large" in found.words

@@ -2,7 +2,7 @@
 
 import inspect
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import control as ct
@@ -386,6 +386,53 @@ def test_backlash_opens_a_loop():
         assert got[k] == pytest.approx(m, abs=1e-12)
     assert got[45] == pytest.approx(u[45] - 0.15)
     assert got[120] == pytest.approx(u[120] + 0.15)
+
+
+def follow_with_play(u, width):
+    """What a backlash that begins in the middle of its gap passes on."""
+    out, m = np.empty(len(u)), u[0]
+    for k, value in enumerate(u):
+        out[k] = m = min(max(m, value - width / 2), value + width / 2)
+    return out
+
+
+def test_a_curve_is_ahead_of_a_backlash_or_behind_it_as_it_is_given():
+    u = TRIANGLE[:-1]
+
+    def bend(v):
+        return np.clip(np.sign(v) * np.maximum(np.abs(v) - 0.2, 0) + 0.1, -0.5, 0.4)
+
+    curves = E.InputSaturation(-0.5, 0.4), E.InputOffset(0.1), E.InputDeadZone(0.4)
+    play = E.InputBacklash(width=0.3)
+    np.testing.assert_allclose(applied(play, *curves), follow_with_play(bend(u), 0.3), atol=1e-12)
+    np.testing.assert_allclose(applied(*curves, play), bend(follow_with_play(u, 0.3)), atol=1e-12)
+    # The limits are behind it, and the others ahead.
+    some = applied(curves[0], play, *curves[1:])
+    ahead = np.sign(u) * np.maximum(np.abs(u) - 0.2, 0) + 0.1
+    np.testing.assert_allclose(some, np.clip(follow_with_play(ahead, 0.3), -0.5, 0.4), atol=1e-12)
+
+
+def test_a_lag_and_what_depends_on_time_stay_behind_a_backlash():
+    u, play = TRIANGLE, E.InputBacklash(width=0.3)
+    for effect in (E.ActuatorLag(tau=0.07), Wobble(0.2)):
+        one, other = (free_run(integrator(), *pair, u=u, dt=DT)
+                      for pair in ((effect, play), (play, effect)))  # fmt: skip
+        np.testing.assert_array_equal(one, other)
+    # A delay may be either way round: it bends nothing.
+    late = E.InputDelay(delay=0.7 * DT)
+    one = free_run(integrator(), late, play, E.InputDeadZone(0.4), u=u, dt=DT)
+    other = free_run(integrator(), play, E.InputDeadZone(0.4), late, u=u, dt=DT)
+    np.testing.assert_array_equal(one, other)
+
+
+@dataclass(frozen=True)
+class Wobble(E.InputEffect):
+    """A gain that changes in time."""
+
+    share: float = E.parameter("", neutral=0.0)
+
+    def input(self, m):
+        return m.u * (1 + self.share * np.sin(m.t))
 
 
 def test_curves_of_the_input():

@@ -305,6 +305,8 @@ def compare_names(found: Search, work: Work) -> Search:
 def _is_stand_in(best: Trial, model: Model, beside: bool) -> bool:
     """Whether an effect gains so much less than what is missing that it can only stand in for it.
 
+    It is none where the tests see hardly anything any more beside it.
+
     Parameters
     ----------
     best : Trial
@@ -316,10 +318,14 @@ def _is_stand_in(best: Trial, model: Model, beside: bool) -> bool:
     """
     if best.gain < THRESHOLD.little_of_known * measure_unexplained_likelihood(model.fit):
         return True
-    if (
-        not (beside and can_simulate(model))
-        or best.gain >= THRESHOLD.small_gain * run_noise_tests(model.fit).evidence
-    ):
+    if not (beside and can_simulate(model)):
+        return False
+    missing = run_noise_tests(model.fit).evidence
+    if best.gain >= THRESHOLD.small_gain * missing:
+        return False
+    # A test of whiteness counts a line once for each lag, and says more than the line is worth.
+    left = run_noise_tests(with_linearization(best.model).fit).evidence
+    if missing - left >= THRESHOLD.small_gain * missing:
         return False
     # The tests may be alarmed by the filter itself: replicas, which take their time, forgive that.
     return best.gain < THRESHOLD.small_gain * retest_with_replicas(model).evidence

@@ -100,7 +100,9 @@ def find_log_error(log: Log) -> LogError | None:
     .. math:: \ln p(y \mid u) = \ln p(a y \mid u) + N \ln |a|,
 
     so that a wrong unit competes with missing effects by the same criterion. The plant alone, with
-    its free parameters, is fitted to the repaired records; it has to do better than the search.
+    its free parameters, is fitted to the repaired records; it has to do better than the search, and
+    than with an input that stands still. Else a random force explains what is logged so, and the
+    plant nothing.
 
     Parameters
     ----------
@@ -114,17 +116,23 @@ def find_log_error(log: Log) -> LogError | None:
     """
     loop, heads = log.loop, log.heads
     found: list[tuple[float, str]] = []
+    goal = log.reached + THRESHOLD.gate
     for words, repair, factor, early in _list_repairs():
         left_out = early * len(heads)
         if _measure(loop, [repair(r) for r in heads], None, factor, left_out) < log.least:
             continue
         whole = [repair(r) for r in log.records]
-        value = _measure(loop, whole, log.audits, factor, left_out)
-        found.append((value - log.reached, words))
-    gains = [gain for gain, _ in found]
-    best = max(gains, default=-math.inf)
-    if not best > THRESHOLD.gate:
+        measure = functools.partial(
+            _measure, loop, audits=log.audits, factor=factor, left_out=left_out
+        )
+        value = measure(whole)
+        if not value > goal:
+            continue
+        if value > measure(_hold(whole, _compute_mean(whole))) + THRESHOLD.gate:
+            found.append((value - log.reached, words))
+    if not found:
         return None
+    best = max(gain for gain, _ in found)
     # Where u enters by its square, or the plant is the same upside down, repairs do the same.
     same = [words for gain, words in found if gain > best - THRESHOLD.gate]
     return LogError(", or ".join(same), best)
@@ -152,12 +160,17 @@ def seems_idle(log: Log) -> bool:
     if not comes_to_rest(replace(loop, controller=None)):
         return False
     # It stands at rest, or where it is on average, or it is off.
-    levels = {loop.point.input, float(np.mean([np.mean(r.u) for r in records])), 0.0}
+    levels = {loop.point.input, _compute_mean(records), 0.0}
     if max(_measure(loop, _hold(log.heads, v), None) for v in levels) < log.least:
         return False
     moved = _measure(loop, records, audits, coloured=True)
     stood = max(_measure(loop, _hold(records, v), audits, coloured=True) for v in levels)
     return stood > max(moved + THRESHOLD.gate, log.reached - THRESHOLD.close)
+
+
+def _compute_mean(records: Sequence[Record]) -> float:
+    """Return where the input is on average."""
+    return float(np.mean([np.mean(r.u) for r in records]))
 
 
 def _hold(records: Sequence[Record], level: float) -> list[Record]:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from ..effects.composition import label_effects, order_effects
 from ..estimation.likelihood.maximization import maximize
 from .candidates import Trial, attempt_trial
 from .fitted_model import Model, carry_over_fit, drop_linearization
@@ -45,7 +46,8 @@ def order_last_effect(model: Model, given: int) -> Model:
     """Return the model with its last effect nearer to the plant, if it fits better there.
 
     What is found last was found second, which says nothing of where it acts: a valve may have its
-    dead zone before the offset or behind it, and in the wrong order both end beside their values.
+    dead zone before the offset or behind it, or before a backlash, and in the wrong order both end
+    beside their values.
 
     Parameters
     ----------
@@ -62,10 +64,13 @@ def order_last_effect(model: Model, given: int) -> Model:
     *others, last = model.fitted.effects
     if not last.ordered:
         return model
-    best = model
+    best, count = model, len(others) + 1
+    seen = {_find_order(model, range(count))}
     for k in range(given, len(others)):
-        if others[k].stage != last.stage:
+        order = _find_order(model, _move_last(k, count))
+        if order in seen:
             continue
+        seen.add(order)
         tried = move_last_effect(model, k)
         if math.isfinite(tried.fit.value):
             tried = replace(
@@ -81,14 +86,25 @@ def move_last_effect(model: Model, position: int) -> Model:
     The likelihood is minus infinity if the filter cannot follow the record then.
     """
     fitted = model.fitted
-    last = len(fitted.effects) - 1
-    order = [*range(position), last, *range(position, last)]
+    order = _move_last(position, len(fitted.effects))
     labels = list(fitted.labelled)
     loop = replace(fitted, effects=tuple(fitted.effects[k] for k in order), free=())
     renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
     loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
     names = rename_labels(model.names, renamed)
     return Model(loop, carry_over_fit(model, loop, names))
+
+
+def _move_last(position: int, count: int) -> list[int]:
+    """Return places of effects, of which the last one has come to another position."""
+    return [*range(position), count - 1, *range(position, count - 1)]
+
+
+def _find_order(model: Model, places: Sequence[int]) -> tuple[int, ...]:
+    """Return places of a model's effects as signals pass them, if the loop has them in an order."""
+    labelled = label_effects(tuple(model.loop.effects[k] for k in places))
+    found = dict(zip(labelled, places, strict=True))
+    return tuple(found[label] for label, _ in order_effects(labelled))
 
 
 def rename_labels(names: Sequence[str], labels: Mapping[str, str]) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
 from .base import AbstractEffect
+from .delays import InputBacklash
 from .kinds import ForceEffect, InputEffect, LawEffect, OutputEffect, ReadingEffect
 
 # These builds call a hook that sees symbols only, so that no formula depends on a value.
@@ -40,6 +41,34 @@ def label_effects(effects: tuple[AbstractEffect, ...]) -> dict[str, AbstractEffe
     return found
 
 
+def order_effects(effects: Mapping[str, AbstractEffect]) -> tuple[tuple[str, AbstractEffect], ...]:
+    """Return effects in the order in which they are put into equations, from the plant outwards.
+
+    Of those at the same place the one given last is furthest from the plant. What bends or limits
+    the input and is given after a backlash acts ahead of it, as the overlap of a valve does that a
+    linkage with play comes behind; a lag does not, for a backlash passes once per sample.
+
+    Parameters
+    ----------
+    effects : mapping of str to effect
+        The effects by name.
+
+    Returns
+    -------
+    tuple of (str, effect)
+        The same, nearest to the plant first.
+    """
+    found: list[tuple[int, str, AbstractEffect]] = []
+    stage_of_curves = InputEffect.stage
+    for label, effect in effects.items():
+        if isinstance(effect, InputBacklash):
+            stage_of_curves = effect.stage
+        curve = isinstance(effect, InputEffect) and not effect.states
+        ahead = curve and effect.stage == InputEffect.stage
+        found.append((stage_of_curves if ahead else effect.stage, label, effect))
+    return tuple((label, effect) for _, label, effect in sorted(found, key=lambda f: f[0]))
+
+
 def compose_effects(
     e: Equations, effects: Mapping[str, AbstractEffect], at: OperatingPoint, dt: float
 ) -> Equations:
@@ -50,8 +79,7 @@ def compose_effects(
     e : Equations
         The plant in absolute physical units.
     effects : mapping of str to effect
-        The effects by name. Of those at the same place the one given last is furthest from the
-        plant.
+        The effects by name, in the order of `order_effects`.
     at : OperatingPoint
         The point that deviations are counted from, with the plant's states.
     dt : float
@@ -62,7 +90,7 @@ def compose_effects(
     Equations
         The equations; lags rest where their targets do.
     """
-    ordered = tuple(sorted(effects.items(), key=lambda pair: pair[1].stage))
+    ordered = order_effects(effects)
     if not ordered:
         return e
     values = dict(e.parameters)

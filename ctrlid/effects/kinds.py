@@ -7,7 +7,7 @@ import casadi
 import numpy as np
 
 from .._base.errors import EffectDoesNotApply
-from ..physics.equations import Equations
+from ..physics.equations import Backlash, Equations
 from ..physics.integration import put_entry
 from ..physics.symbols import Symbol
 from .base import AbstractEffect, Place, refuse_missing_formula, require_motion
@@ -83,7 +83,25 @@ class InputEffect(AbstractEffect):
         applied = to_expression(trace_hook(self.input)(m))
         if len(e.inputs) > 1:
             applied = put_entry(e.u, e.inputs.index(self.at), applied)
+        if e.play is not None and not _depends_on_others(applied, e):
+            return _put_ahead_of_backlash(e, e.play, applied)
         return substitute_symbol(e, e.u, applied)
+
+
+def _depends_on_others(applied: Any, e: Equations) -> bool:
+    """Whether an applied input depends on more than the computed one and parameters."""
+    return bool(casadi.depends_on(applied, casadi.vertcat(e.t, e.x, casadi.vec(e.spread))))
+
+
+def _put_ahead_of_backlash(e: Equations, play: Backlash, bent: Any) -> Equations:
+    """Return equations whose backlash follows the input as it is bent, in place of the input."""
+    bent = casadi.substitute(casadi.SX(bent), e.u, play.u)
+    after, applied, start = (
+        casadi.substitute(casadi.SX(value), play.u, bent)
+        for value in (play.after, play.applied, play.start)
+    )
+    play = dataclasses.replace(play, after=after, applied=applied, start=start)
+    return dataclasses.replace(e, play=play)
 
 
 def require_one_input(effect: AbstractEffect, e: Equations) -> None:
