@@ -38,6 +38,7 @@ from .screening import screen_at
 from .several_records import describe_presence
 from .thresholds import THRESHOLD
 from .verdict import (
+    blame_slow_force,
     choose_verdict,
     describe_grounds,
     find_doubt,
@@ -109,6 +110,8 @@ def assemble_answer(
     effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
     objection = find_doubt(effects, gains, total)
     objection = objection or describe_grounds(grounds)
+    if not (findings or stand_ins):
+        objection = blame_slow_force(disturbance, gap.force_unit)
     complete = found.after.passed and not left and objection is None
     verdict = choose_verdict(complete, named=bool(findings))
     notes = (*fitted.estimate.notes, *_list_notes(loop, found))

@@ -109,6 +109,40 @@ def find_doubt(
     return None
 
 
+def blame_slow_force(disturbance: Disturbance, unit: str) -> str | None:
+    """Say that a slow force moves the plant, where it makes most of what noise accounts for.
+
+    White noise is what any plant has. What pushes it the same way for many samples is something,
+    even where the catalogue has no name for it: a parameter that wanders, say, or the wind.
+
+    Parameters
+    ----------
+    disturbance : Disturbance
+        The random forces of a model in which nothing was named.
+    unit : str
+        Unit of the force.
+
+    Returns
+    -------
+    str or None
+        What acts, as a clause; None where no slow force is large.
+    """
+    if not (disturbance.large and disturbance.coloured):
+        return None
+    return (f"{_describe_slow_force(disturbance, unit)} acts on the plant, and causes "
+            f"{_write_share(disturbance)}")  # fmt: skip
+
+
+def _describe_slow_force(disturbance: Disturbance, unit: str) -> str:
+    size = write_quantity(disturbance.coloured, unit, digits=2)
+    time = write_quantity(disturbance.time_constant, "s", digits=2)
+    return f"a slowly varying random force of {size} RMS with a time constant of {time}"
+
+
+def _write_share(disturbance: Disturbance) -> str:
+    return f"{100 * disturbance.share:.0f} % of the variance of the noise floor"
+
+
 def _are_look_alikes(one: AbstractEffect, other: AbstractEffect) -> bool:
     """Whether one of two effects is known to resemble the other."""
     if one.place == other.place and one.at != other.at:
@@ -252,9 +286,12 @@ def write_conclusion(
             text += f" {noise}"
     elif verdict == "explained":
         text = f"The model lacks {names}. With {them} the residuals are noise."
-    elif (findings or stand_ins) and after.passed and objection is not None:
-        every = join_names([*findings, *(f for f, _ in stand_ins)])
-        text = f"With {every} the residuals are noise, but {objection}."
+    elif after.passed and objection is not None:
+        every = [*findings, *(f for f, _ in stand_ins)]
+        if every:
+            text = f"With {join_names(every)} the residuals are noise, but {objection}."
+        else:
+            text = f"The residuals are noise, but {objection}. {_deny_tried(tried)}."
     elif verdict == "partly explained":
         text = (f"{names} {verb} part of the error. The rest is not noise alone: {why}. "
                 f"{_deny_tried(tried)}.")  # fmt: skip
@@ -268,14 +305,11 @@ def write_conclusion(
     left = [w for w in where if w.p_after < THRESHOLD.surely_left]
     if left and verdict in ("partly explained", "unknown"):
         text += f" The remaining error depends on {' and '.join(w.axis for w in left[:2])}."
-    if disturbance.large:
-        kind = "A random force"
+    told = verdict == "unknown" and not stand_ins and doubted
+    if disturbance.large and not told:
+        kind = "a random force"
         if disturbance.coloured:
-            kind = (
-                "A slowly varying random force of "
-                f"{write_quantity(disturbance.coloured, gap.force_unit, digits=2)} RMS with a time "
-                f"constant of {write_quantity(disturbance.time_constant, 's', digits=2)}"
-            )
-        text += (f" {kind} causes {100 * disturbance.share:.0f} % of the variance of the noise "
-                 "floor. It is treated as noise here, and may hide a missing effect.")  # fmt: skip
+            kind = _describe_slow_force(disturbance, gap.force_unit)
+        text += (f" {kind[:1].upper()}{kind[1:]} causes {_write_share(disturbance)}. It is treated "
+                 "as noise here, and may hide a missing effect.")  # fmt: skip
     return text
