@@ -9,12 +9,16 @@ import pytest
 from scipy import signal
 
 import ctrlid as cid
+from ctrlid import effects as E
+from ctrlid._base.errors import ModelCannotRun
 from ctrlid.diagnosis import gap_summary
 from ctrlid.diagnosis.findings import Disturbance, Gap
-from ctrlid.diagnosis.fresh_data import FreshData
+from ctrlid.diagnosis.fresh_data import FreshData, choose_fresh_data
 from ctrlid.diagnosis.gap import (
     Window,
+    _average_runs,
     compute_excess_chance,
+    compute_floor,
     compute_widening_chance,
     halve_windows,
     measure_constant_error,
@@ -23,10 +27,12 @@ from ctrlid.diagnosis.gap import (
     root_mean_square,
     simulate_window,
 )
+from ctrlid.diagnosis.recalibration import fit_base_model
+from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.wording import describe_trivial, list_gap_rows
 from ctrlid.estimation.likelihood.prediction import predict_from, predict_spread
 from ctrlid.validation.reproduction import CLOSED_LOOP, Reproduction
-from problems import diagnose_draw
+from problems import diagnose_draw, drive, record_of
 from test_wiring import CART, DT, at_rest, luenberger
 
 NOTHING = Disturbance(0.0, 0.0, np.nan, 0.0)
@@ -301,3 +307,49 @@ def test_a_right_name_whose_simulation_diverges_stays():
     assert found.gap.kind == "prediction"
     assert found.gap.after < 0.3 * found.gap.before
     assert "diverges on the samples kept back" in found.notes[-1]
+
+
+def fresh_under_noise(real, record, names):
+    """Fresh data of a record, without noise and with that of the true model, and its loops."""
+    model = fit_base_model(real, [record], names)
+    fresh = choose_fresh_data(real, [record], None)
+    return model, fresh, fresh.with_noise(model), fresh.prepare_loops(model)
+
+
+def test_noise_shakes_a_play_loose():
+    """Without noise a loop with a play hunts in the simulation, and in the record it does not."""
+    real = drive().with_effect(E.InputBacklash(0.4))
+    record = record_of(real, swing=0.3, hold=60, n=3000, seed=40, sensor_noise=1e-2)
+    model, still, shaken, loops = fresh_under_noise(real, record, ("InputBacklash.width",))
+    floors = [compute_floor(loops, model.fit, f.windows, f.how).both for f in (still, shaken)]
+    gaps = [f.measure_gap(loops) for f in (still, shaken)]
+    assert gaps[1] < 0.9 * gaps[0]
+    assert floors[1] < 0.9 * floors[0]
+    assert 0.8 < gaps[1] / floors[1] < 1.25
+    windows = still.windows
+    hunts = [f.simulate_outputs(loops) for f in (still, shaken)]
+    assert compute_widening_chance(windows, *reversed(hunts)) < 1e-3
+
+
+def test_of_a_linear_loop_the_mean_is_the_run_without_noise():
+    loop = drive()
+    record = record_of(loop, swing=0.3, hold=60, n=1200, seed=42, sensor_noise=1e-3)
+    model, still, shaken, loops = fresh_under_noise(loop, record, ("k",))
+    assert [len(w.noises) for w in (*still.windows, *shaken.windows)] == [0, THRESHOLD.mean_runs]
+    one, other = (f.simulate_outputs(loops)[0] for f in (still, shaken))
+    np.testing.assert_allclose(other, one, atol=1e-12)
+    # What is predicted, or simulated from the measured input, begins with what was measured.
+    ahead = replace(still, how=Reproduction("prediction", 5))
+    assert ahead.with_noise(model) is ahead
+
+
+def test_a_run_that_leaves_its_range_is_left_out():
+    class Runs:
+        def run(self, simulator, noise=None):
+            if noise is not None and noise[0][0] > 2:
+                raise ModelCannotRun("far away")
+            return np.zeros(3) if noise is None else 1 + noise[0] ** 2, None
+
+    calm, wild = [np.ones(3)], [np.full(3, 3.0)]
+    np.testing.assert_array_equal(_average_runs(Runs(), None, (calm, wild), slice(0, 3)), 2.0)
+    np.testing.assert_array_equal(_average_runs(Runs(), None, (wild,), slice(0, 3)), 0.0)

@@ -35,8 +35,9 @@ class Gap(Printed):
     Parameters
     ----------
     kind : str
-        What was compared: ``"simulation"``, which uses no measured output, or ``"prediction"``,
-        which uses those up to `horizon` samples before.
+        What was compared: ``"simulation"``, which uses no measured output (closed loop it is the
+        mean of runs with noise), or ``"prediction"``, which uses those up to `horizon` samples
+        before.
     given, before, after : float
         RMS error of the model as handed in, the smaller of that and of the recalibrated model's,
         and with the effects added [output unit], all on the samples of which each model makes

@@ -26,7 +26,7 @@ from ..estimation.likelihood.prediction import (
 from ..loop.loop import Loop
 from ..loop.wiring import match_signals
 from ..validation.record_audit import FEW
-from ..validation.reproduction import Reproduction, choose_reproduction
+from ..validation.reproduction import CLOSED_LOOP, Reproduction, choose_reproduction
 from . import gap as gaps
 from .fitted_model import Model
 from .recalibration import cut_stretches
@@ -171,6 +171,15 @@ class FreshData:
         # The chance that one output's noise is too large, of several, is that of any.
         chances = stats.chi2.cdf(worth * squares / usual, worth)
         return float(min(1.0, outputs * np.min(chances)))
+
+    def with_noise(self, model: Model) -> Self:
+        """Return the same with loops simulated under draws of a model's noise.
+
+        A prediction and an open-loop simulation begin with what was measured, noise and all.
+        """
+        if self.how != CLOSED_LOOP:
+            return self
+        return replace(self, windows=gaps.draw_noises(model.fit, self.windows))
 
     def weigh_outputs(self, model: Model) -> Self:
         """Return the same with several outputs counted in units of the floors of a model."""

@@ -1,5 +1,6 @@
 """Step 9: how far a model is from data it was not fitted to, and what noise alone would leave."""
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from ..estimation.likelihood.tails import JointTails, Tails
 from ..loop.loop import Loop, find_converter_steps
 from ..loop.period_map import count_forces
 from ..loop.simulation import Simulator, make_simulator
-from ..validation.record_simulation import find_long_stretches, prepare_stretch
+from ..validation.record_simulation import Stretch, find_long_stretches, prepare_stretch
 from ..validation.reproduction import Reproduction
 from .thresholds import THRESHOLD
 
@@ -31,13 +32,15 @@ class Window:
 
     `start_time` is the time of its first sample since the start of the record, `mask` what is
     compared. Of several outputs `mask` has a row for each, and their errors count in units of
-    `scales`, the floors.
+    `scales`, the floors. `noises` are draws of sensor noise and random force, with which loops are
+    simulated.
     """
 
     record: Record
     start_time: float
     mask: Any
     scales: tuple[float, ...] = ()
+    noises: tuple[Sequence[Array], ...] = ()
 
     def choose_output(self, k: int) -> "Window":
         """Return the same for one of several outputs, in its own unit."""
@@ -277,7 +280,14 @@ def compute_excess_chance(
 
 
 def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
-    """Return what a loop makes of a window: a simulation, or a prediction some samples ahead.
+    r"""Return what a loop makes of a window: a simulation, or a prediction some samples ahead.
+
+    .. math:: \hat y = \mathrm{E}[y \mid r] \approx \frac1{2R} \sum_{i=1}^R \bigl(y(r, w_i) +
+        y(r, -w_i)\bigr)
+
+    with draws w of the noise, if the window has some. Noise shakes a backlash loose and rounds a
+    curve: a simulation without it is not what the loop does on average. Of a linear loop both are
+    the same.
 
     Parameters
     ----------
@@ -308,10 +318,26 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     for part in find_long_stretches(record):
         try:
             stretch = prepare_stretch(simulator, record, part, start_time=window.start_time)
-            y[..., part] = stretch.run(simulator)[0]
+            y[..., part] = _average_runs(stretch, simulator, window.noises, part)
         except ModelCannotRun:
             continue
     return y
+
+
+def _average_runs(
+    stretch: Stretch, simulator: Simulator, noises: Sequence[Sequence[Array]], part: slice
+) -> Array:
+    """Return the mean of simulations with each noise and its opposite; without noises, that alone.
+
+    A loop that noise drives out of its range now and then did not leave it in the record.
+    """
+    runs: list[Array] = []
+    for noise in noises:
+        pair = [[sign * np.asarray(v)[..., part] for v in noise] for sign in (1, -1)]
+        with contextlib.suppress(ModelCannotRun):
+            one, other = (stretch.run(simulator, each)[0] for each in pair)
+            runs.append((one + other) / 2)
+    return np.mean(runs, axis=0) if runs else stretch.run(simulator)[0]
 
 
 def make_gap_simulator(
@@ -471,7 +497,7 @@ def _simulate_noise(
         if not use.any():
             continue
         stretch = prepare_stretch(simulator, record, part, start_time=window.start_time)
-        rest = stretch.run(simulator)[0]
+        rest = _average_runs(stretch, simulator, window.noises, part)
         for seed in range(runs):
             noise = draw_noise(fit, sensor, rest.shape[-1], seed)
             for k, both in enumerate((noise, [noise[0], 0 * noise[1]])):
@@ -488,6 +514,19 @@ def _simulate_noise(
         squares *= (size / np.maximum(count, 1))[:, None, None]
         return np.asarray(np.maximum(squares, hidden[:, None, None]))
     return np.asarray(np.maximum(squares * (size / count), hidden[0]))
+
+
+def draw_noises(fit: Fit, windows: Sequence[Window]) -> tuple[Window, ...]:
+    """Return the windows with draws of a fit's noise."""
+    found = []
+    # Other seeds than those of the runs that say what noise makes.
+    seeds = range(THRESHOLD.size_runs, THRESHOLD.size_runs + THRESHOLD.mean_runs)
+    for k, window in enumerate(windows):
+        sensor = float(fit.sensor[min(k, len(fit.sensor) - 1)])
+        n = window.record.y.shape[-1]
+        noises = tuple(draw_noise(fit, sensor, n, seed) for seed in seeds)
+        found.append(replace(window, noises=noises))
+    return tuple(found)
 
 
 def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:

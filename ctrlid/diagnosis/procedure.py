@@ -304,7 +304,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         q.end()
     search = replace(search, final=measure_rounding(search.final))
     fresh = lengthen_horizon(q.loop, search, q.fresh)
-    q = replace(q, fresh=fresh.weigh_outputs(search.final))
+    q = replace(q, fresh=fresh.with_noise(search.final).weigh_outputs(search.final))
     helps = make_fresh_data_test(q.fresh)
     if search.found or not search.after.passed:
         # A wrong sign or unit in the log makes the plant look as if almost anything were missing.
@@ -342,6 +342,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     # What was fitted anew has its noise measured anew.
     search = replace(search, final=measure_rounding(search.final))
     # Step 9: the gap before and after. An effect of one of several records may widen the others'.
+    q = replace(q, fresh=q.fresh.with_noise(search.final))
     summary = summarize_gap(q.loop, search, q.fresh)
     simulated = q.fresh.how
     fresh, summary = replace_divergence(q.loop, search, summary, q.fresh)

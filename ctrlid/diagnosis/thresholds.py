@@ -431,6 +431,10 @@ class Thresholds:
         8, cost="the same where a gap stands out: loops that hunt differ from run to run",
         unit="runs",
     )  # fmt: skip
+    mean_runs: int = declare_number(
+        8, cost="pairs of simulations with noise and its opposite, whose mean is compared: with 4 "
+        "times as many a gap changes by 2 % at most", unit="pairs",
+    )  # fmt: skip
     size_runs: int = declare_number(
         32, cost="simulations whose spread tells an error that is too small for the noise: of the "
         "first 8 seeds it is half as wide as of many", unit="runs",

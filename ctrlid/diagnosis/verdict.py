@@ -175,15 +175,9 @@ def gap_stands_out(gap: Gap, fit: Fit, chance: float = math.nan) -> bool:
     )
 
 
-def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
-    """Whether effects leave a wider gap than sensor noise does, by itself, in a loop with them.
-
-    With friction and backlash a loop hunts, and no simulation follows it for long: the widest of
-    several runs counts. Two gaps below the floor differ by chance.
-    """
-    noise = max(gap.floor, gap.widest)
-    by_noise = not disturbance.large and gap.after <= THRESHOLD.excess * noise
-    return max(gap.before, gap.floor) < gap.after and not by_noise
+def gap_is_wider(gap: Gap) -> bool:
+    """Whether effects leave a wider gap than there was; two below the floor differ by chance."""
+    return max(gap.before, gap.floor) < gap.after
 
 
 def describe_grounds(stand_ins: Sequence[tuple[Finding, str]]) -> str | None:
