@@ -4,10 +4,12 @@ Groups: what is found; nothing; without a controller; several records; what one 
 outside the catalogue; refusals.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy import signal
 
 import ctrlid as cid
 from ctrlid import CtrlidError
@@ -128,6 +130,26 @@ def test_nothing_is_missing(analog, seed):
     assert min(found.tests.values()) > 1e-4
     for name, values in kept.items():
         np.testing.assert_array_equal(getattr(record, name), values)
+
+
+@pytest.mark.parametrize(("memory", "verdict"), [(0.0, "nothing missing"), (0.98, "unknown")])
+def test_a_slow_force_is_something_and_a_white_one_is_not(memory, verdict):
+    """A wind that no effect of the catalogue is: 0.3 V at an actuator of 30 N/V before 2 kg."""
+    loop, n = drive(), 2000
+    steps = np.random.default_rng(61).standard_normal(n)
+    wind = 0.3 * signal.lfilter([math.sqrt(1 - memory**2)], [1, -memory], steps)
+    r = cid.random_binary(n, amplitude=0.3, hold=60, seed=60)
+    blown = cid.simulate(loop, r, d=wind, sensor_noise=1e-4, seed=62)
+    record = replace(blown, u=np.asarray(blown.u) - wind)
+    few = (E.CoulombFriction, E.InputOffset, E.InputDelay)
+    found = cid.diagnose(loop, record, catalogue=few, progress=False)
+    assert found.verdict == verdict
+    assert not found.findings
+    if memory:
+        assert "a slowly varying random force of" in found.sentence
+        # Forty time constants tell them to some extent.
+        assert 0.5 < found.disturbance.coloured / (15 * np.std(wind)) < 2
+        assert 0.5 < found.disturbance.time_constant / (-0.01 / math.log(memory)) < 3
 
 
 # --- without a controller
