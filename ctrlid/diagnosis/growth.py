@@ -305,7 +305,7 @@ def compare_names(found: Search, work: Work) -> Search:
 def _is_stand_in(best: Trial, model: Model, beside: bool) -> bool:
     """Whether an effect gains so much less than what is missing that it can only stand in for it.
 
-    It is none where the tests see hardly anything any more beside it.
+    It is none where the tests see nothing any more beside it.
 
     Parameters
     ----------
@@ -320,12 +320,10 @@ def _is_stand_in(best: Trial, model: Model, beside: bool) -> bool:
         return True
     if not (beside and can_simulate(model)):
         return False
-    missing = run_noise_tests(model.fit).evidence
-    if best.gain >= THRESHOLD.small_gain * missing:
+    if best.gain >= THRESHOLD.small_gain * run_noise_tests(model.fit).evidence:
         return False
     # A test of whiteness counts a line once for each lag, and says more than the line is worth.
-    left = run_noise_tests(with_linearization(best.model).fit).evidence
-    if missing - left >= THRESHOLD.small_gain * missing:
+    if run_noise_tests(with_linearization(best.model).fit).passed:
         return False
     # The tests may be alarmed by the filter itself: replicas, which take their time, forgive that.
     return best.gain < THRESHOLD.small_gain * retest_with_replicas(model).evidence

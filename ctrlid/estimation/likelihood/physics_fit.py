@@ -37,6 +37,7 @@ from .maximization import (
     refit_noise_size,
     refit_quiet_force,
 )
+from .noise.force_size import measure_doubt_by_force
 from .physics_estimate import LoopEstimate, LoopFit, mark_unseen, note_absurd_values
 
 # A given value is contradicted where the fit is farther from it than three of its standard
@@ -336,6 +337,7 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     inverse = pseudo_inverse(matrix[np.ix_(rows, rows)])
     kept = rows[rows < p]
     covariance[np.ix_(kept, kept)] = inverse[: len(kept), : len(kept)]
+    covariance += measure_doubt_by_force(fit)
     covariance, notes = mark_unseen(covariance, matrix, inside, names)
     noise, scale = fit.noise, float(np.mean(fit.sensor))
     e = loop.equations()
