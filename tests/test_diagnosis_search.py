@@ -997,7 +997,7 @@ def test_a_dead_zone_ends_on_its_side_of_a_backlash(order):
     hidden = E.InputDeadZone(0.3), E.InputBacklash(0.2)
     for k in order:
         real = real.with_effect(hidden[k])
-    record = problems.record_of(real, swing=0.3, hold=60, n=2000, seed=9970, sensor_noise=1e-4)
+    record = problems.record_of(real, swing=0.3, hold=60, n=1200, seed=9970, sensor_noise=1e-4)
     for found in (hidden, hidden[::-1]):
         both = loop.with_effect(found[0]).with_effect(found[1])
         own = ("InputDeadZone.width", "InputBacklash.width")
