@@ -5,7 +5,8 @@
 record, diagnoses and writes a line for each draw; draws that the file has already are left out, so
 that a run that was interrupted goes on. The full study is ``run --full``. ``print FILE`` prints
 tables with Wilson's 95 % intervals, ``print --misses FILE`` each wrong answer as well.
-``rerun FILE --lines 5`` diagnoses lines of the file again and compares the answers.
+``rerun FILE --lines 5`` diagnoses lines of the file again and compares the answers, and
+``rerun FILE --draws two:85012 clean:85300`` those that are named.
 """
 
 from __future__ import annotations
@@ -381,13 +382,21 @@ def find_misses(lines: Sequence[dict[str, Any]]) -> list[str]:
         if not wrong:
             continue
         hidden = " + ".join(f"{t} ({w:.0f})" for t, w in zip(x["truth"], x["worth"], strict=True))
-        answer = x.get("error") or " + ".join("/".join(f["set"]) for f in x["findings"])
-        stand_ins = " + ".join("/".join(f["set"]) for f in x.get("stand_ins", []))
         out.append(f"{x['class']} {x['seed']} {x['plant']}, {x['noise']} noise, law {x['law']}: "
                    f"{hidden or 'nothing'}{', which swallow all of u' * bool(x.get('swallowed'))} "
-                   f"-> {x.get('verdict', 'raised')}: {answer or 'no name'}"
-                   + (f"; stand-ins {stand_ins}" if stand_ins else ""))  # fmt: skip
+                   f"-> {write_answer(x)}")  # fmt: skip
     return out
+
+
+def write_answer(line: dict[str, Any]) -> str:
+    """Return the verdict of a line, its findings and what only stands in."""
+    found, stand_ins = (
+        " + ".join("/".join(f["set"]) for f in line.get(kind, []))
+        for kind in ("findings", "stand_ins")
+    )
+    answer = line.get("error") or found or "no name"
+    told = f"{line.get('verdict', 'raised')}: {answer}"
+    return f"{told}; stand-ins {stand_ins}" if stand_ins else told
 
 
 def describe_draws(lines: Sequence[dict[str, Any]]) -> str:
@@ -468,18 +477,26 @@ def main() -> None:
     prints.add_argument("--misses", action="store_true", help="and each wrong answer")
     again = commands.add_parser("rerun", help="diagnose lines of a file again")
     again.add_argument("file")
-    again.add_argument("--lines", type=int, default=5)
+    again.add_argument("--lines", type=int, default=5, help="so many, spread evenly")
+    again.add_argument("--draws", nargs="+", metavar="CLASS:SEED", help="these in their place")
     options = parser.parse_args()
     if options.command == "print":
         print(write_tables(read(options.file), options.misses))
         return
     if options.command == "rerun":
         lines = read(options.file)
-        for x in lines[:: max(len(lines) // options.lines, 1)][: options.lines]:
-            print(
-                *make_key(x),
-                "the same" if is_same_answer(x, run(*make_key(x))) else "ANOTHER ANSWER",
-            )
+        if options.draws:
+            named = {f"{x['class']}:{x['seed']}": x for x in lines}
+            chosen = [named[draw] for draw in options.draws]
+        else:
+            chosen = lines[:: max(len(lines) // options.lines, 1)][: options.lines]
+        for x in chosen:
+            again = run(*make_key(x), watched=False)
+            told = "the same"
+            if not is_same_answer(x, again):
+                one, other = write_answer(x), write_answer(again)
+                told = f"the same names: {one}" if one == other else f"{one} -> {other}"
+            print(*make_key(x), " + ".join(x["truth"]) or "nothing", told, sep="  ", flush=True)
         return
     if options.full:
         first = options.first

@@ -55,6 +55,15 @@ def write_tables(name, path=None):
     return out + [f"- {miss}" for miss in study.find_misses(lines)]
 
 
+def write_number_tables():
+    """Return the table of the numbers of judgement as lines of a page."""
+    lines = read_study("study_frozen")[1]
+    numbers = load_study("study_numbers")
+    changed = numbers.study.read(BENCHMARKS / "numbers.jsonl.gz", numbers.study.make_changed_key)
+    rows = numbers.write_rows(lines, changed)
+    return write_list_table(numbers.HEAD, rows, "22 8 8 16 12 10 12 12")
+
+
 def write_summary(name, path=None):
     """Return what has a target, what was measured and the target, as a list of sentences."""
     study, lines = read_study(name, path)
@@ -80,7 +89,10 @@ class Study(Directive):
         """Return the tables."""
         name, *how = self.arguments
         place = nodes.Element()
-        lines = write_summary(name) if how == ["summary"] else write_tables(name)
+        if name == "study_numbers":
+            lines = write_number_tables()
+        else:
+            lines = write_summary(name) if how == ["summary"] else write_tables(name)
         self.state.nested_parse(StringList(lines, source=name), self.content_offset, place)
         return place.children
 

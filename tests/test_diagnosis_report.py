@@ -157,7 +157,7 @@ def test_report_of_a_clean_bill(found):
     words = text(found["nothing missing"])
     assert "Nothing missing. Noise" in words
     assert "where the error is: nowhere. In bins of velocity, position and time, the one" in words
-    assert "smallest size of each effect that this record would have shown" in words
+    assert "size of each effect that 80 of 100 records like this one would have shown" in words
     assert "CoulombFriction.fc 21 mm/s^2" in words
     assert "ActuatorLag.tau 0.11 ms" in words
     assert "Homemade.size 3" in words
@@ -446,6 +446,26 @@ def test_own_effects_are_found_by_name(found, tmp_path):
     path.write_text(stranger, "utf-8")
     with pytest.raises(cid.CtrlidError, match=r"'Unheard', but no effect .*; import it first"):
         load_diagnosis(path)
+
+
+def test_sizes_that_are_shown_with_other_probabilities(found, tmp_path):
+    clean = replace(
+        found["nothing missing"], sensitivity={"CoulombFriction.fc": 0.05},
+        sensitivity_errors={"CoulombFriction.fc": 0.01},
+    )  # fmt: skip
+    assert clean.find_sensitivity() == clean.sensitivity
+    half, most = (clean.find_sensitivity(p)["CoulombFriction.fc"] for p in (0.5, 0.95))
+    assert half == pytest.approx(0.05 - 0.8416 * 0.01, abs=1e-6)
+    assert most == pytest.approx(0.05 + (1.6449 - 0.8416) * 0.01, abs=1e-6)
+    assert load_diagnosis(clean.save(tmp_path / "f.json")).find_sensitivity(0.5) == {
+        "CoulombFriction.fc": half
+    }
+    with pytest.raises(cid.CtrlidError, match="a probability between 0 and 1; given 1"):
+        clean.find_sensitivity(1.0)
+    older = replace(clean, sensitivity_errors={})
+    with pytest.raises(cid.CtrlidError, match="without the standard errors of its sensitivity"):
+        older.find_sensitivity(0.5)
+    assert replace(older, sensitivity={}).find_sensitivity(0.5) == {}
 
 
 def test_what_is_no_saved_diagnosis_is_refused(found, tmp_path):
@@ -769,7 +789,7 @@ def test_page(found, verdict, tmp_path):
     assert ('<p class="bad">' in page) == (bad or verdict == "nothing missing")
     assert ("SOMETHING IS" in page) == bad
     assert ("1. CoulombFriction: a force of constant size" in page) == ("explained" in verdict)
-    assert ("smallest size that this record would have shown" in page) == (
+    assert ("size that 80 of 100 records like this one would have shown" in page) == (
         verdict == "nothing missing"
     )
     assert ("LARGE RANDOM FORCE" in page) == (verdict == "nothing missing")

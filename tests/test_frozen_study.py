@@ -356,3 +356,24 @@ def test_what_came_close_to_a_single_finding_is_compared_under_its_noise(seed, n
     assert found.verdict == "explained"
     (finding,) = found.findings
     assert set(finding.names) == names
+
+
+def test_sizes_that_are_asked_for_are_those_of_the_simulator():
+    power = load_script("benchmarks", "study_power")
+    for name, (own, key, signs) in power.EFFECTS.items():
+        parameter, compute = study.SIZES[name]
+        assert parameter == own
+        assert compute({key: 2.0}, 0.5) == (1.0 if name == "InputDelay" else 2.0)
+        effect = getattr(cid.effects, name)
+        (only,) = [p for p in effect.parameters() if p.neutral is not None]
+        assert (-1 in signs) == (only.lower < 0), name
+
+
+def test_the_table_of_powers_counts_what_was_shown():
+    power = load_script("benchmarks", "study_power")
+    lines = [{"seed": k, "power": 0.5, "commit": "a", "name": "InputDelay", "shown": k < 3}
+             for k in range(4)] + [{"seed": 9, "power": 0.5, "commit": "a"}]  # fmt: skip
+    told = power.write_tables(lines).splitlines()
+    assert told[0] == "4 draws of commit a, 1 more without a size"
+    assert told[1].startswith("50 % predicted  3 of 4: 75.0 %")
+    assert told[-1].split() == ["InputDelay", "3", "of", "4,", "2.0", "due"]

@@ -33,7 +33,7 @@ from .recalibration import fit_base_model
 from .records import Readout
 from .refitting import refit_candidate
 from .removal import Weighed
-from .result import Diagnosis
+from .result import Diagnosis, shift_visible_size
 from .screening import screen_at
 from .several_records import describe_presence
 from .thresholds import THRESHOLD
@@ -119,6 +119,7 @@ def assemble_answer(
     tests = dict(found.after.p_values)
     ranking = _rank_candidates(found)
     noise = describe_noise(found.final.fit, gap.unit)
+    sizes, size_errors = _find_sensitivity(found)
     sentence = write_conclusion(
         verdict, findings, gap, disturbance, found.after, where, None if left else objection,
         len({type(c.effect) for c in ranking}), grounds, noise,
@@ -130,8 +131,8 @@ def assemble_answer(
         )
     return Diagnosis(
         verdict, sentence, findings, final, gap, where, ranking, disturbance,
-        calibrated, _find_sensitivity(found), tests, remarks, notes, noise=noise,
-        stand_ins=stand_ins,
+        calibrated, sizes, tests, remarks, notes, noise=noise, stand_ins=stand_ins,
+        sensitivity_errors=size_errors,
     )  # fmt: skip
 
 
@@ -292,25 +293,24 @@ def _rank_candidates(found: Search) -> tuple[Candidate, ...]:
     return tuple(rows)
 
 
-def _find_sensitivity(found: Search) -> dict[str, float]:
-    """Return the size of each one-parameter effect that would have earned a place."""
+def _find_sensitivity(found: Search) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the size of each one-parameter effect that is due to be shown, and its error."""
     sizes: dict[str, float] = {}
-    if not found.steps:
-        return sizes
-    for t in found.steps[-1].trials:
-        size = _find_smallest_visible(t)
+    errors: dict[str, float] = {}
+    for t in found.steps[-1].trials if found.steps else ():
+        error = _find_own_error(t)
         kind, own = name_with_subject(t.effect), t.effect.parameters()
         key = f"{kind}.{own[0].name}" if own else kind
-        if math.isfinite(size) and key not in sizes:
-            sizes[key] = size
-    return sizes
+        if math.isfinite(error) and key not in sizes:
+            half = error * math.sqrt(2 * (THRESHOLD.gate + t.full_penalty))
+            sizes[key], errors[key] = shift_visible_size(half, error, 0.5, THRESHOLD.power), error
+    return sizes, errors
 
 
-def _find_smallest_visible(t: Trial) -> float:
+def _find_own_error(t: Trial) -> float:
+    """Return the standard error of an effect's only parameter; NaN where the record has none."""
     if len(t.effect.values()) != 1 or not t.label or not math.isfinite(t.score):
         return math.nan
     fit = t.model.fit
     k = t.model.names.index(f"{t.label}.{t.effect.parameters()[0].name}")
-    if not fit.normal[0][k, k] > 0:
-        return math.nan
-    return float(fit.standard_errors[k]) * math.sqrt(2 * (THRESHOLD.gate + t.full_penalty))
+    return float(fit.standard_errors[k]) if fit.normal[0][k, k] > 0 else math.nan

@@ -91,6 +91,7 @@ def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
         noise=_decode(SensorNoise, data["noise"]) if data.get("noise") else None,
         stand_ins=tuple(_decode(Finding, f) for f in data.get("stand_ins", ())),
         finished=bool(data.get("finished", True)),
+        sensitivity_errors=read_numbers(data.get("sensitivity_errors", {})),
     )  # fmt: skip
     check_fields(found, "loop")
     return found

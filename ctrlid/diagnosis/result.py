@@ -4,7 +4,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from scipy import stats
+
 from .._base.arguments import check_arguments
+from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
@@ -20,6 +23,7 @@ from .findings import (
 )
 from .report_text import write_report_text
 from .saving import save_diagnosis
+from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +51,8 @@ class Diagnosis(Printed):
     calibrated : tuple of Calibrated
         The model's own free parameters.
     sensitivity : dict of str to float
-        The smallest size [unit of the parameter] of each effect that this record would have shown,
-        by name of the parameter, such as ``"CoulombFriction.fc"``.
+        The size [unit of the parameter] of each effect that 80 of 100 such records would have
+        shown, by name of the parameter, such as ``"CoulombFriction.fc"``; see `find_sensitivity`.
     tests : dict of str to float
         Probabilities that the final innovations are noise, by name of the test.
     audit : tuple of str
@@ -68,6 +72,8 @@ class Diagnosis(Printed):
         on what ground its name does not stand. `loop`, `gap` and `where` are with them.
     finished : bool
         Whether the search came to its end; not if its budget of seconds was spent before.
+    sensitivity_errors : dict of str to float
+        Standard errors of these sizes [unit of the parameter]; empty in files of earlier versions.
     """
 
     verdict: Verdict
@@ -89,6 +95,7 @@ class Diagnosis(Printed):
     noise: SensorNoise | None = None
     stand_ins: tuple[Finding, ...] = ()
     finished: bool = True
+    sensitivity_errors: dict[str, float] = field(default_factory=dict, repr=False)
 
     @property
     def effects(self) -> tuple[AbstractEffect, ...]:
@@ -99,6 +106,48 @@ class Diagnosis(Printed):
     def added(self) -> tuple[Finding, ...]:
         """All that was added to the model: findings, then stand-ins."""
         return (*self.findings, *self.stand_ins)
+
+    def find_sensitivity(self, power: float = THRESHOLD.power) -> dict[str, float]:
+        r"""Return the size of each effect that a record like this one shows so often.
+
+        .. math:: s_p = \sigma \bigl(\sqrt{2 (g + c)} + \Phi^{-1}(p)\bigr)
+
+        An effect is named if its estimate is worth more than the gate g and its penalty c. The
+        estimate scatters about the true size with the standard error :math:`\sigma`, so that one
+        of the size :math:`\sigma \sqrt{2 (g + c)}` is named in half of the records only.
+
+        Parameters
+        ----------
+        power : float, optional
+            The probability p, between 0 and 1.
+
+        Returns
+        -------
+        dict of str to float
+            Sizes [unit of the parameter] by name, as in `sensitivity`.
+
+        Raises
+        ------
+        CtrlidError
+            If the probability is not between 0 and 1, or if the diagnosis was saved by a version
+            that kept no standard errors.
+
+        References
+        ----------
+        Lehmann and Romano, *Testing Statistical Hypotheses*, 2005, chapter 3 (power).
+        """
+        check_arguments(Diagnosis.find_sensitivity, locals())
+        if not 0 < power < 1:
+            raise CtrlidError(f"power= needs a probability between 0 and 1; given {power:g}")
+        if self.sensitivity and not self.sensitivity_errors:
+            raise CtrlidError(
+                "this diagnosis was saved without the standard errors of its sensitivity; diagnose "
+                "the record again to ask for another power"
+            )
+        return {
+            name: shift_visible_size(size, self.sensitivity_errors[name], THRESHOLD.power, power)
+            for name, size in self.sensitivity.items()
+        }
 
     def __str__(self) -> str:
         return write_report_text(self)
@@ -134,3 +183,8 @@ class Diagnosis(Printed):
         """
         check_arguments(Diagnosis.save, locals())
         return save_diagnosis(self, path)
+
+
+def shift_visible_size(size: float, error: float, power: float, other: float) -> float:
+    """Return the size that is shown with another power than a size that is shown with one."""
+    return size + error * float(stats.norm.ppf(other) - stats.norm.ppf(power))

@@ -211,6 +211,10 @@ class Thresholds:
                                 unit="steps of the climb")  # fmt: skip
 
     # Step 6: decide.
+    power: float = declare_number(
+        0.8, convention="sizes that a record would have shown are those that so many records like "
+        "it show; as usual in planning experiments", unit="of the records",
+    )  # fmt: skip
     gate: float = declare_number(
         5.0, law="a difference of 10 of the Bayesian information criterion is very strong",
         unit="of net gain", source="Kass and Raftery 1995",

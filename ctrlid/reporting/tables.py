@@ -294,7 +294,7 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
         )
         made.append(Table(columns, places, PLACES))
     if found.verdict == "nothing missing" and found.sensitivity:
-        made.append(Table(("effect", "smallest size that this record would have shown"),
+        made.append(Table(("effect", "size that 80 of 100 records like this one would have shown"),
                           tuple(wording.list_sensitivity_rows(found))))  # fmt: skip
     made.append(Title("Parameters, noise and remarks"))
     parameters = tuple(
