@@ -841,13 +841,16 @@ def test_what_is_put_back_and_stuck_keeps_its_evidence(two_found, monkeypatch):
     assert kept.gain == pytest.approx(right.gain, rel=0.01)
 
 
-def test_a_gap_below_the_floor_is_not_wider():
+def test_a_gap_about_the_floor_takes_no_name_back():
     def gap(after):
         return Gap("simulation", 9.0, 3.0, after, 4.0, "m", *[np.zeros(3)] * 4)
 
-    assert not gap_is_wider(gap(2.9))
-    assert not gap_is_wider(gap(3.9))  # above the gap before, and below the floor
-    assert gap_is_wider(gap(4.4))
+    sensor, force = Disturbance(0.1, 0.0, np.nan, 0.2), Disturbance(0.1, 0.0, np.nan, 0.9)
+    assert not gap_is_wider(gap(2.9), force)
+    assert not gap_is_wider(gap(3.9), force)  # above the gap before, and below the floor
+    assert not gap_is_wider(gap(4.4), sensor)
+    assert gap_is_wider(gap(4.4), force)
+    assert gap_is_wider(gap(6.1), sensor)
 
 
 def test_what_went_astray_beside_an_effect_begins_without_it_as_handed_in():

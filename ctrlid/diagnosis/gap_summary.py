@@ -222,7 +222,7 @@ def take_back_widening(
     The half of the samples that shows it better decides which name goes, and what fresh data like
     in its place; the gap is reported on the other half.
     """
-    if not found.found or not gap_is_wider(summary.gap):
+    if not found.found or not gap_is_wider(summary.gap, summary.disturbance):
         return found, summary
     made = _reproduce(loop, found, fresh)
     if made.compute_widening_chance(fresh.windows) >= THRESHOLD.beyond_chance:

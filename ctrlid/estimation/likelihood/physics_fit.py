@@ -337,7 +337,9 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     inverse = pseudo_inverse(matrix[np.ix_(rows, rows)])
     kept = rows[rows < p]
     covariance[np.ix_(kept, kept)] = inverse[: len(kept), : len(kept)]
-    covariance += measure_doubt_by_force(fit)
+    # What has no influence at all has none beside another force either.
+    seen = np.diag(covariance) > 0
+    covariance += np.where(np.outer(seen, seen), measure_doubt_by_force(fit), 0.0)
     covariance, notes = mark_unseen(covariance, matrix, inside, names)
     noise, scale = fit.noise, float(np.mean(fit.sensor))
     e = loop.equations()
