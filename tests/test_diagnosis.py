@@ -150,6 +150,26 @@ def test_a_slow_force_is_something():
     assert 0.5 < found.disturbance.time_constant / (-0.01 / math.log(memory)) < 3
 
 
+def test_a_curve_of_an_input_with_two_values_is_not_visible_in_any_size():
+    """It is a gain and a bias there; a third value makes it one."""
+    plant = cid.plants.servo(m=1.0, c=2.0, k=5.0)
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    loop = cid.Loop(plant, None, dt=0.02, at=at, free=("c", "k"))
+    catalogue = (E.InputNonlinearity, E.InputOffset, E.QuadraticDrag)
+    two = np.repeat(np.random.default_rng(3).choice([-1.0, 1.0], 60), 20)
+    three = np.repeat(np.random.default_rng(3).choice([-1.0, 0.3, 1.0], 60), 20)
+    biased = loop.with_effect(E.InputOffset(0.0))
+    biased = replace(biased, free=("c", "k", "InputOffset.offset"))
+    shown = []
+    for u in (two, three):
+        record = cid.simulate(biased, d=u - u.mean(), sensor_noise=1e-3, seed=4)
+        found = cid.diagnose(biased, record, catalogue=catalogue, progress=False)
+        assert found.verdict == "nothing missing"
+        shown.append(found.find_sensitivity(0.5)["InputNonlinearity.curvature"])
+    assert math.isinf(shown[0])
+    assert 0 < shown[1] < 1
+
+
 # --- without a controller
 
 

@@ -1,5 +1,6 @@
 """The answer of a diagnosis: its findings, gap and verdict put together from the search."""
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,6 +15,7 @@ from ..effects import AbstractEffect, Quantization, equivalents
 from ..effects.base import name_with_subject
 from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
+from ..estimation.likelihood.physics_estimate import is_unseen
 from ..estimation.likelihood.physics_fit import summarize_fit
 from ..estimation.likelihood.tails import JointTails, Tails
 from ..loop.loop import Loop
@@ -26,6 +28,7 @@ from ..loop.velocities import (
 from .candidates import Trial, is_same_kind
 from .experiment import find_experiment
 from .findings import COMPLETE, Calibrated, Candidate, Finding, SensorNoise
+from .fitted_model import with_mean_force
 from .gap_summary import GapSummary
 from .grounds import Case, find_ground
 from .growth import Search
@@ -297,20 +300,40 @@ def _find_sensitivity(found: Search) -> tuple[dict[str, float], dict[str, float]
     """Return the size of each one-parameter effect that is due to be shown, and its error."""
     sizes: dict[str, float] = {}
     errors: dict[str, float] = {}
-    for t in found.steps[-1].trials if found.steps else ():
-        error = _find_own_error(t)
+    if not found.steps:
+        return sizes, errors
+    base = None if found.found else with_mean_force(found.steps[-1].base)
+    for t in found.steps[-1].trials:
         kind, own = name_with_subject(t.effect), t.effect.parameters()
         key = f"{kind}.{own[0].name}" if own else kind
-        if math.isfinite(error) and key not in sizes:
-            half = error * math.sqrt(2 * (THRESHOLD.gate + t.full_penalty))
+        if key in sizes or len(t.effect.values()) != 1 or not math.isfinite(t.score):
+            continue
+        error = _find_own_error(t if base is None else screen_at(base, t.effect, t.scan_penalty))
+        root = math.sqrt(2 * (THRESHOLD.gate + t.full_penalty))
+        if base is not None and t.effect.neutral and math.isfinite(error):
+            # What a curve shows of its size is less where it is bent than where it is straight.
+            with contextlib.suppress(EffectDoesNotApply):
+                there = replace(t.effect, **{own[0].name: (own[0].neutral or 0.0) + root * error})
+                bent = _find_own_error(screen_at(base, there, t.scan_penalty))
+                error = error if math.isnan(bent) else max(error, bent)
+        if not math.isnan(error):
+            half = root * error
             sizes[key], errors[key] = shift_visible_size(half, error, 0.5, THRESHOLD.power), error
     return sizes, errors
 
 
 def _find_own_error(t: Trial) -> float:
-    """Return the standard error of an effect's only parameter; NaN where the record has none."""
-    if len(t.effect.values()) != 1 or not t.label or not math.isfinite(t.score):
+    """Return the standard error of an effect's only parameter; NaN where the record has none.
+
+    It is infinite where other parameters make up for any size: a curve of an input with two values
+    is a gain and a bias.
+    """
+    name = f"{t.label}.{t.effect.parameters()[0].name}"
+    if not t.label or not math.isfinite(t.score) or name not in t.model.names:
         return math.nan
-    fit = t.model.fit
-    k = t.model.names.index(f"{t.label}.{t.effect.parameters()[0].name}")
-    return float(fit.standard_errors[k]) if fit.normal[0][k, k] > 0 else math.nan
+    fit, k = t.model.fit, t.model.names.index(name)
+    matrix = fit.normal[0]
+    if not matrix[k, k] > 0:
+        return math.nan
+    unseen = is_unseen(matrix, np.flatnonzero(np.diag(matrix) > 0), k)
+    return math.inf if unseen else float(fit.standard_errors[k])

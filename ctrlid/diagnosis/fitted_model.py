@@ -16,12 +16,14 @@ from ..estimation.likelihood.kalman_filter import carry_trajectory, guess_trajec
 from ..estimation.likelihood.likelihood import (
     Fit,
     evaluate_likelihood,
+    evaluate_linearized,
     list_parameter_bounds,
     list_start_values,
     relinearize_fit,
 )
 from ..estimation.likelihood.maximization import quieten_force
 from ..estimation.likelihood.noise.coordinates import count_noise_parameters
+from ..estimation.likelihood.noise.force_size import find_mean_force
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..estimation.likelihood.tails import choose_law
 from ..loop.loop import Loop
@@ -132,6 +134,15 @@ def keep_information(fit: Fit, bare: Fit) -> Fit:
 def with_linearization(model: Model) -> Model:
     """Return a model whose fit has the plant along its trajectory."""
     return model if model.fit.linearized else replace(model, fit=relinearize_fit(model.fit))
+
+
+def with_mean_force(model: Model) -> Model:
+    """Return a model beside the mean of the random forces that its record allows."""
+    model = with_linearization(model)
+    fit, noise = model.fit, find_mean_force(model.fit)
+    if noise == fit.noise or not math.isfinite(fit.value):
+        return model
+    return replace(model, fit=evaluate_linearized(fit.problem, fit.theta, noise, fit.linearized))
 
 
 def compute_log_terms(fit: Fit) -> Array:

@@ -1,5 +1,6 @@
 """The result of a diagnosis."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -187,4 +188,6 @@ class Diagnosis(Printed):
 
 def shift_visible_size(size: float, error: float, power: float, other: float) -> float:
     """Return the size that is shown with another power than a size that is shown with one."""
+    if math.isinf(error):
+        return math.inf
     return size + error * float(stats.norm.ppf(other) - stats.norm.ppf(power))

@@ -377,7 +377,7 @@ def mark_unseen(
     """
     p, covariance = len(names), covariance.copy()
     rows = np.flatnonzero(inside & (np.diag(matrix) > 0))
-    lost = [k for k in range(p) if inside[k] and (matrix[k, k] <= 0 or _is_unseen(matrix, rows, k))]
+    lost = [k for k in range(p) if inside[k] and (matrix[k, k] <= 0 or is_unseen(matrix, rows, k))]
     for k in lost:
         covariance[k, :] = covariance[:, k] = 0.0
         covariance[k, k] = math.inf
@@ -389,7 +389,7 @@ def mark_unseen(
     )
 
 
-def _is_unseen(matrix: Array, rows: Any, k: int) -> bool:
+def is_unseen(matrix: Array, rows: Any, k: int) -> bool:
     """Return whether a parameter takes part in a direction that is not in the data."""
     if k not in rows:
         return False

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...._base.arrays import Array
 from ...._base.statistics import pseudo_inverse
+from ..kalman_filter import Noise
 from ..likelihood import Fit, evaluate_linearized, relinearize_fit
 from .coordinates import choose_force_ratios
 
@@ -57,18 +58,40 @@ def measure_doubt_by_force(fit: Fit) -> Array:
         return total
     fit = fit if fit.linearized else relinearize_fit(fit)
     for which in range(len(fit.noise.force)):
-        total[np.ix_(rows, rows)] += _measure_one(fit, rows, which)
+        likely = _list_likely_sizes(fit, rows, which)
+        if likely is not None:
+            _, shares, moments = likely
+            now = _weigh_size(fit, rows, which, math.sqrt(fit.noise.force[which]))[1]
+            mean = sum(w * m for w, m in zip(shares, moments, strict=True))
+            total[np.ix_(rows, rows)] += _keep_positive(mean - now)
     return total
 
 
-def _measure_one(fit: Fit, rows: Any, which: int) -> Array:
-    """Return what the spread of one force's size adds to the covariance of some parameters."""
+def find_mean_force(fit: Fit) -> Noise:
+    """Return the noise of a fit with the mean of the likely sizes for each force that is not known.
+
+    What a record like this one would show depends on the force that acts in it, of which the
+    likeliest size is often zero.
+    """
+    force = list(fit.noise.force)
+    if fit.known is None and not fit.noise.drift:
+        fit = fit if fit.linearized else relinearize_fit(fit)
+        rows = np.flatnonzero(np.diag(fit.normal[0]) > 0)
+        for which in range(len(force)):
+            likely = _list_likely_sizes(fit, rows, which)
+            if likely is not None:
+                force[which] = float(likely[1] @ likely[0]) ** 2
+    return replace(fit.noise, force=tuple(force))
+
+
+def _list_likely_sizes(fit: Fit, rows: Any, which: int) -> tuple[Array, Array, list[Array]] | None:
+    """Return sizes of one force, how likely each is, and the moments there; None if it is known."""
     weigh = functools.cache(functools.partial(_weigh_size, fit, rows, which))
     size = math.sqrt(fit.noise.force[which])
-    best, moment = weigh(size)
+    best = weigh(size)[0]
     pair = [weigh(size * factor)[0] for factor in (1 / KNOWN_FACTOR, KNOWN_FACTOR)]
     if max(pair) < best - KNOWN_COST or not math.isfinite(best):
-        return np.zeros_like(moment)
+        return None
     largest = max(size, UNSEEN * math.sqrt(choose_force_ratios(fit.problem)[which]))
     for _ in range(MOST_STEPS):
         value = weigh(largest)[0]
@@ -83,9 +106,7 @@ def _measure_one(fit: Fit, rows: Any, which: int) -> Array:
     weights = np.exp(logs - np.max(logs))
     # Half of each end of the trapezoids.
     weights[[0, -1]] /= 2
-    return _keep_positive(
-        sum(w * m for w, (_, m) in zip(weights, seen, strict=True)) / np.sum(weights) - moment
-    )
+    return sizes, weights / np.sum(weights), [moment for _, moment in seen]
 
 
 def _weigh_size(fit: Fit, rows: Any, which: int, size: float) -> tuple[float, Array]:
