@@ -243,6 +243,9 @@ RECIPES: dict[str, Recipe] = {
     "ParameterEstimate.confidence_interval": lambda w, rng: {"self": w.fit.estimate, "name": "c", "level": rng.uniform(0.1, 0.99)},
     "IdentifiedSystem.to_states": lambda w, rng: {"self": w.system, "order": pick(rng, None, 2, 4)},
     "IdentifiedModel.with_delay": lambda w, rng: {"self": w.continuous, "order": 2},
+    "Diagnosis.find_sensitivity": lambda w, rng: {
+        "self": w.found, "power": float(rng.uniform(0.05, 0.95))
+    },
     "Diagnosis.save": lambda w, rng: {"self": w.found, "path": FOLDER / "again.json"},
     "plants.ball_on_beam": lambda w, rng: {"m": 0.05, "J": rng.uniform(0.01, 1), "radius": 0.01},
     "plants.cart_pole": lambda w, rng: {"M": rng.uniform(0.1, 2), "m": 0.2, "length": 0.3, "c": 0.1},
@@ -314,6 +317,7 @@ def is_finite_model(given: Arguments, model: Any) -> bool:
 
 
 INVARIANTS: dict[str, Callable[[Arguments, Any], bool]] = {
+    "Diagnosis.find_sensitivity": lambda given, out: all(size > 0 for size in out.values()),
     "Record": is_finite_record, "Record.between": is_finite_record,
     "Record.decimate": is_finite_record, "Record.from_csv": is_finite_record,
     "Record.from_response": is_finite_record, "Record.with_input": is_finite_record,

@@ -103,6 +103,8 @@ def _list_likely_sizes(fit: Fit, rows: Any, which: int) -> tuple[Array, Array, l
     sizes[0] = UNSEEN * largest
     seen = [weigh(float(a)) for a in sizes]
     logs = np.array([value for value, _ in seen])
+    if not np.isfinite(logs).any():
+        return None
     weights = np.exp(logs - np.max(logs))
     # Half of each end of the trapezoids.
     weights[[0, -1]] /= 2
