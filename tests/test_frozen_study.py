@@ -377,3 +377,11 @@ def test_the_table_of_powers_counts_what_was_shown():
     assert told[0] == "4 draws of commit a, 1 more without a size"
     assert told[1].startswith("50 % predicted  3 of 4: 75.0 %")
     assert told[-1].split() == ["InputDelay", "3", "of", "4,", "2.0", "due"]
+
+
+def test_the_page_has_a_row_for_each_number_and_value():
+    table = load_script("docs", "study_tables").write_number_tables()
+    numbers = load_script("benchmarks", "study_numbers")
+    rows = [line for line in table if line.startswith("   * - ")]
+    assert len(rows) == 1 + 2 * len(numbers.list_judged_numbers())
+    assert sum("none run" in line for line in table) <= 4  # near no draw of the study
