@@ -74,8 +74,8 @@ def run(seed: int, n: int = study.SAMPLES) -> list[Line]:
         found = None if record is None else cid.diagnose(loop, record, progress=False)
         if found is None or found.verdict != "nothing missing":
             return [{"seed": seed, "power": p, "n": n, "commit": commit} for p in POWERS]
-        able = [k for k, (own, _, _) in EFFECTS.items()
-                if rig.plant in cases.HOSTS[k] and f"{k}.{own}" in found.sensitivity]  # fmt: skip
+        able = [k for k, (own, _, _) in EFFECTS.items() if rig.plant in cases.HOSTS[k]
+                and np.isfinite(found.sensitivity.get(f"{k}.{own}", np.inf))]  # fmt: skip
         lines = []
         for power in POWERS:
             name = str(rng.choice(able))

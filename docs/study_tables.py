@@ -57,8 +57,8 @@ def write_tables(name, path=None):
 
 def write_number_tables():
     """Return the table of the numbers of judgement as lines of a page."""
-    lines = read_study("study_frozen")[1]
     numbers = load_study("study_numbers")
+    lines = numbers.study.read(BENCHMARKS / FILES["study_frozen"])
     changed = numbers.study.read(BENCHMARKS / "numbers.jsonl.gz", numbers.study.make_changed_key)
     rows = numbers.write_rows(lines, changed)
     return write_list_table(numbers.HEAD, rows, "22 8 8 16 12 10 12 12")

@@ -420,7 +420,7 @@ def _measure_each_output(
     q = len(windows[0].record.y)
     squares, counts = np.zeros((q, runs, 2)), np.zeros(q)
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
-        noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
+        noise = _find_sensor_variance(fit, k)
         try:
             squares += _simulate_noise(loop, fit, noise, window, how, runs)
         except (ModelCannotRun, EffectDoesNotApply):
@@ -452,7 +452,7 @@ def measure_noise_errors(
         return _weigh_outputs(each, counts, windows)
     squares, count = np.zeros((runs, 2)), 0
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
-        noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
+        noise = _find_sensor_variance(fit, k)
         try:
             squares += _simulate_noise(loop, fit, noise, window, how, runs)
         except (ModelCannotRun, EffectDoesNotApply):
@@ -516,13 +516,18 @@ def _simulate_noise(
     return np.asarray(np.maximum(squares * (size / count), hidden[0]))
 
 
+def _find_sensor_variance(fit: Fit, k: int) -> float:
+    """Return the variance of the sensor noise in a window; further windows have the last one's."""
+    return float(fit.sensor[min(k, len(fit.sensor) - 1)])
+
+
 def draw_noises(fit: Fit, windows: Sequence[Window]) -> tuple[Window, ...]:
     """Return the windows with draws of a fit's noise."""
     found = []
     # Other seeds than those of the runs that say what noise makes.
     seeds = range(THRESHOLD.size_runs, THRESHOLD.size_runs + THRESHOLD.mean_runs)
     for k, window in enumerate(windows):
-        sensor = float(fit.sensor[min(k, len(fit.sensor) - 1)])
+        sensor = _find_sensor_variance(fit, k)
         n = window.record.y.shape[-1]
         noises = tuple(draw_noise(fit, sensor, n, seed) for seed in seeds)
         found.append(replace(window, noises=noises))

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from .._base.text import write_number, write_quantity
 from . import wording
 from .findings import Finding, Gap
-from .thresholds import THRESHOLD
 
 if TYPE_CHECKING:
     from .result import Diagnosis
@@ -118,8 +117,7 @@ def _write_sensitivity(found: Diagnosis) -> list[str]:
             for key, size in wording.list_sensitivity_rows(found)]  # fmt: skip
     half = (len(rows) + 1) // 2
     right = [*rows[half:], ""][:half]
-    share = f"{100 * THRESHOLD.power:.0f} of 100"
-    head = f"  size of each effect that {share} records like this one would have shown"
+    head = f"  size of each effect that {wording.describe_power()}"
     wide = max(map(len, rows[:half]), default=0)
     if 8 + wide + max(map(len, right), default=0) > WIDTH:
         return [head, *(f"    {row}" for row in rows)]

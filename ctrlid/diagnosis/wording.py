@@ -536,6 +536,11 @@ def describe_size(found: Diagnosis, finding: Finding) -> str:
     return f"{size} ({force})" if force else size
 
 
+def describe_power() -> str:
+    """Say how many records would have shown effects of the sizes that are listed."""
+    return f"{100 * THRESHOLD.power:.0f} of 100 records like this one would have shown"
+
+
 def list_sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
     """Return the smallest visible size of each effect."""
     tried = {name_with_subject(c.effect): c.effect for c in found.ranking}

@@ -294,7 +294,7 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
         )
         made.append(Table(columns, places, PLACES))
     if found.verdict == "nothing missing" and found.sensitivity:
-        made.append(Table(("effect", "size that 80 of 100 records like this one would have shown"),
+        made.append(Table(("effect", f"size that {wording.describe_power()}"),
                           tuple(wording.list_sensitivity_rows(found))))  # fmt: skip
     made.append(Title("Parameters, noise and remarks"))
     parameters = tuple(

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -57,13 +58,12 @@ def measure_doubt_by_force(fit: Fit) -> Array:
     if fit.known is not None or fit.noise.drift or not len(rows):
         return total
     fit = fit if fit.linearized else relinearize_fit(fit)
-    for which in range(len(fit.noise.force)):
-        likely = _list_likely_sizes(fit, rows, which)
+    for which, variance in enumerate(fit.noise.force):
+        weigh = functools.cache(functools.partial(_weigh_size, fit, rows, which))
+        likely = _list_likely_sizes(fit, which, weigh)
         if likely is not None:
-            _, shares, moments = likely
-            now = _weigh_size(fit, rows, which, math.sqrt(fit.noise.force[which]))[1]
-            mean = sum(w * m for w, m in zip(shares, moments, strict=True))
-            total[np.ix_(rows, rows)] += _keep_positive(mean - now)
+            mean = sum(share * weigh(float(size))[1] for size, share in zip(*likely, strict=True))
+            total[np.ix_(rows, rows)] += _keep_positive(mean - weigh(math.sqrt(variance))[1])
     return total
 
 
@@ -78,15 +78,18 @@ def find_mean_force(fit: Fit) -> Noise:
         fit = fit if fit.linearized else relinearize_fit(fit)
         rows = np.flatnonzero(np.diag(fit.normal[0]) > 0)
         for which in range(len(force)):
-            likely = _list_likely_sizes(fit, rows, which)
+            weigh = functools.cache(functools.partial(_weigh_size, fit, rows, which))
+            likely = _list_likely_sizes(fit, which, weigh)
             if likely is not None:
-                force[which] = float(likely[1] @ likely[0]) ** 2
+                sizes, shares = likely
+                force[which] = float(shares @ sizes) ** 2
     return replace(fit.noise, force=tuple(force))
 
 
-def _list_likely_sizes(fit: Fit, rows: Any, which: int) -> tuple[Array, Array, list[Array]] | None:
-    """Return sizes of one force, how likely each is, and the moments there; None if it is known."""
-    weigh = functools.cache(functools.partial(_weigh_size, fit, rows, which))
+def _list_likely_sizes(
+    fit: Fit, which: int, weigh: Callable[[float], tuple[float, Array]]
+) -> tuple[Array, Array] | None:
+    """Return sizes of one force, and how likely each is; None if its size is known."""
     size = math.sqrt(fit.noise.force[which])
     best = weigh(size)[0]
     pair = [weigh(size * factor)[0] for factor in (1 / KNOWN_FACTOR, KNOWN_FACTOR)]
@@ -101,14 +104,13 @@ def _list_likely_sizes(fit: Fit, rows: Any, which: int) -> tuple[Array, Array, l
         largest *= STEP
     sizes = np.linspace(0.0, largest, SIZES + 1)
     sizes[0] = UNSEEN * largest
-    seen = [weigh(float(a)) for a in sizes]
-    logs = np.array([value for value, _ in seen])
+    logs = np.array([weigh(float(a))[0] for a in sizes])
     if not np.isfinite(logs).any():
         return None
     weights = np.exp(logs - np.max(logs))
     # Half of each end of the trapezoids.
     weights[[0, -1]] /= 2
-    return sizes, weights / np.sum(weights), [moment for _, moment in seen]
+    return sizes, weights / np.sum(weights)
 
 
 def _weigh_size(fit: Fit, rows: Any, which: int, size: float) -> tuple[float, Array]:
