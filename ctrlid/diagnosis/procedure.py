@@ -214,10 +214,11 @@ def diagnose(
     >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
     >>> op = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
     >>> loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, at=op, free=("k", "c"))
-    >>> r = cid.random_binary(3000, amplitude=0.1, hold=50, seed=1)
+    >>> r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
     >>> real = loop.with_effect(cid.effects.CoulombFriction(fc=0.5))
     >>> record = cid.simulate(real, r, sensor_noise=1e-4, seed=2)
-    >>> found = cid.diagnose(loop, record, progress=False)
+    >>> few = (cid.effects.ViscousFriction, cid.effects.CoulombFriction, cid.effects.InputDelay)
+    >>> found = cid.diagnose(loop, record, catalogue=few, progress=False)
     >>> found.verdict, found.findings[0].name
     ('explained', 'CoulombFriction')
     """
