@@ -53,13 +53,16 @@ def within(finding, real, widths=4.5):
          {"swing": 1e-4, "sensor_noise": 2e-6, "force_noise": 0.02}),
         pytest.param(drive, E.CoulombFriction(fc=0.4), 7300,
                      {"swing": 0.03, "hold": 60, "sensor_noise": 2e-4}, marks=pytest.mark.slow),
-        (beam, E.QuadraticDrag(c2=2.0), 7400,
-         {"swing": 0.05, "levels": 0.1, "hold": 60, "sensor_noise": 1e-4}),
+        pytest.param(beam, E.QuadraticDrag(c2=2.0), 7400,
+                     {"swing": 0.05, "levels": 0.1, "hold": 60, "sensor_noise": 1e-4},
+                     marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_one_effect_is_named_and_closes_the_gap(build, effect, seed, options):
     loop = build()
-    record = experiment(loop.with_effect(effect), seed, **options)
+    # A levitation moves through all its states within two seconds, the others take longer.
+    n = 1000 if build is levitation else 4000
+    record = experiment(loop.with_effect(effect), seed, n=n, **options)
     found = diagnose(loop, record, seed, catalogue=FEW if seed == 7100 else SOME)
     assert found.verdict == "explained"
     assert len(found.findings) == 1
@@ -97,8 +100,9 @@ def test_two_effects():
     loop = levitation()
     hidden = E.CoulombFriction(fc=0.06), E.SensorNonlinearity(curvature=8.0)
     real = loop.with_effect(hidden[0]).with_effect(hidden[1])
-    record = experiment(real, 7500, 1e-4, levels=1e-3, sensor_noise=2e-6)
-    found = diagnose(loop, record, 7500, catalogue=FEW)
+    record = experiment(real, 7500, 1e-4, n=1000, levels=1e-3, sensor_noise=2e-6)
+    few = (E.ViscousFriction, E.CoulombFriction, E.SensorNonlinearity, E.InputDelay)
+    found = diagnose(loop, record, 7500, catalogue=few)
     sets = [set(f.names) | set(f.equivalents) for f in found.findings]
     for effect in hidden:
         assert any(type(effect).__name__ in names for names in sets)
@@ -281,7 +285,7 @@ def test_two_workers_find_the_same(tmp_path):
     loop = levitation()
     real = loop.with_effect(E.ViscousFriction(c=3.0))
     record = experiment(real, 8300, 1e-4, n=1000, sensor_noise=2e-6)
-    one, two = (diagnose(loop, record, 8300, jobs=jobs, catalogue=FEW) for jobs in (1, 2))
+    one, two = (diagnose(loop, record, 8300, jobs=jobs, catalogue=FEW[:3]) for jobs in (1, 2))
     assert replace(one.disturbance) == two.disturbance
     assert [f.effect for f in one.findings] == [f.effect for f in two.findings]
     assert [(c.round, c.effect) for c in one.ranking] == [(c.round, c.effect) for c in two.ranking]
@@ -330,7 +334,7 @@ def test_nothing_free_and_no_catalogue():
 )
 def test_what_the_catalogue_lacks_is_not_explained_by_a_wrong_name(effect, seed):
     loop = levitation()
-    n = 2500 if type(effect) is E.ParameterStep else 4000
+    n = 2500 if type(effect) is E.ParameterStep else 1200
     record = experiment(loop.with_effect(effect), seed, 1e-4, levels=1e-3, n=n, sensor_noise=2e-6)
     poor = (E.SensorNonlinearity, E.InputDelay, E.CubicStiffness, E.InputOffset)
     found = diagnose(loop, record, seed, catalogue=poor)
