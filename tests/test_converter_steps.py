@@ -133,7 +133,7 @@ def test_fit_of_an_encoder_has_white_innovations_and_honest_intervals():
 
 
 def test_nothing_is_missing_behind_an_encoder():
-    found = cid.diagnose(make_arm(), simulate_arm(1800), progress=False)
+    found = cid.diagnose(make_arm(), simulate_arm(1200), progress=False)
     assert found.verdict == "nothing missing"
     assert found.noise.kind == "white"
     assert found.noise.size == pytest.approx(STEP / math.sqrt(12), rel=0.25)
@@ -151,7 +151,7 @@ def test_an_effect_is_named_behind_an_encoder(hidden, name, size):
     effects = cid.effects
     few = [effects.CoulombFriction, effects.ActuatorLag, effects.InputDeadZone,
            effects.QuadraticDrag, effects.ConstantForce]  # fmt: skip
-    record = simulate_arm(1800, **hidden)
+    record = simulate_arm(1200, **hidden)
     found = cid.diagnose(make_arm(), record, catalogue=few, progress=False)
     assert found.verdict == "explained"
     (finding,) = found.findings

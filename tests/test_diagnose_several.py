@@ -177,7 +177,7 @@ def list_wild_shares(found):
     return [share for _, share, _ in found.noise.tails]
 
 
-@pytest.mark.parametrize("output", [0, 1])
+@pytest.mark.parametrize("output", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_wild_readings_of_one_output_are_its_noise(output, tmp_path):
     record = simulate(800, seed=1, louder=make_wild(800, output, 1))
     found = cid.diagnose(make_loop(), record, catalogue=FEW, progress=False)
@@ -225,7 +225,9 @@ def simulate_encoder(n, friction, seed):
 @pytest.fixture(scope="module")
 def on_encoder():
     return [
-        cid.diagnose(make_loop(), simulate_encoder(800, (fc, 0.0), seed=1),
+        # Names and steps are asked of it, no simulation, which takes longest beside friction.
+        cid.diagnose(replace(make_loop(), controller=None) if fc else make_loop(),
+                     simulate_encoder(500, (fc, 0.0), seed=1),
                      catalogue=[*FEW, cid.effects.Quantization], progress=False)
         for fc in (0.0, 0.4)
     ]  # fmt: skip
@@ -253,7 +255,7 @@ def test_friction_is_named_at_its_place_beside_an_encoder(on_encoder):
 
 
 def test_the_steps_of_an_encoder_are_read_off_whatever_is_in_the_catalogue():
-    record = simulate_encoder(800, (0.0, 0.0), seed=1)
+    record = simulate_encoder(500, (0.0, 0.0), seed=1)
     found = cid.diagnose(make_loop(), record, catalogue=FEW, progress=False)
     assert found.verdict == "nothing missing"
 

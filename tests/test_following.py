@@ -31,8 +31,8 @@ def rubbing(fc):
     return levitation(*([E.CoulombFriction(fc=fc)] if fc else []), dt=0.001)
 
 
-def record_of(loop, seed):
-    return problems.record_of(loop, swing=3e-4, hold=30, n=3000, seed=seed, sensor_noise=4e-6,
+def record_of(loop, seed, n=1500):
+    return problems.record_of(loop, swing=3e-4, hold=30, n=n, seed=seed, sensor_noise=4e-6,
                               force_noise=0.01)  # fmt: skip
 
 
@@ -148,7 +148,7 @@ ARM = ct.nlsys(
 @pytest.mark.parametrize("filter_time", [0.01, 0.02, None])
 def test_answer_about_a_coarse_encoder_needs_no_controller(filter_time):
     """The steps reach u through the law, whether it is stated rightly, wrongly or not at all."""
-    r, u, y = log_arm()
+    r, u, y = log_arm(2000)
     law = None
     if filter_time:
         law = cid.PID(kp=4, ki=6, kd=0.35, filter_time=filter_time, derivative="measurement")
@@ -174,7 +174,7 @@ def test_law_is_found_in_the_recorded_input():
 
 def test_dead_zone_is_about_zero_where_a_weight_is_held():
     """It was found about the operating point's input, with the rest of the error unexplained."""
-    r, u, y = log_arm(2500, step=0.01, zone=3.0)
+    r, u, y = log_arm(1500, step=0.01, zone=3.0)
     record = cid.Record(r=r, u=u, y=y, dt=0.01)
     law = cid.PID(kp=4, ki=6, kd=0.35, filter_time=0.01, derivative="measurement")
     at = cid.operating_point(ARM, output=2.0)

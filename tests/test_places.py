@@ -233,7 +233,7 @@ def test_dry_friction_of_a_cart_is_named_at_the_cart_by_its_position_alone():
     rng = np.random.default_rng(3)
     gains = np.array([-4.47, -4.77, -31.7, -5.67])
     x, steps = np.zeros(4), 20
-    n = 2400
+    n = 1200
     r = np.repeat(rng.choice([-0.15, 0.15], n // 100 + 1), 100)[:n]
     u, y = np.zeros(n), np.zeros(n)
 

@@ -159,7 +159,7 @@ def test_hum_is_never_the_plant_alone():
 
 def test_a_drift_that_settles_is_told_from_a_steady_one():
     loop = cid.Loop(cid.plants.servo(M, C, K), ct.tf([20.0], [1.0], DT), dt=DT, free=("c", "k"))
-    r = np.tile(reference(), 8)
+    r = np.tile(reference(), 5)
     last = DT * (len(r) - 1)
     noise = 1e-3 * np.random.default_rng(6).standard_normal(len(r))
     time = 0.2 * last
@@ -187,7 +187,7 @@ def test_a_drift_that_settles_is_no_constant_force():
 def test_hum_on_a_levitated_ball_is_named_beside_the_force_that_fits_as_well():
     """What a scan found pays for the scan on both sides of a comparison."""
     loop = levitation()
-    r = 0.012 + cid.random_binary(2000, amplitude=2e-4, hold=60, seed=4)
+    r = 0.012 + cid.random_binary(1200, amplitude=2e-4, hold=60, seed=4)
     record = cid.simulate(levitation(E.SensorHum(8e-6, 60.0, 0.3)), r, sensor_noise=8e-6, seed=4)
     found = cid.diagnose(loop, record, catalogue=(E.SensorHum, E.PeriodicForce))
     (finding,) = found.findings

@@ -55,7 +55,7 @@ def test_which_texts_are_units():
 def degrees():
     """Return a loop, and a record of it with friction, in degrees and per cent."""
     loop = turntable({})
-    record = record_of(loop, E.CoulombFriction(3.0), 1.0, 1e-3, 11, n=400)
+    record = record_of(loop, E.CoulombFriction(3.0), 1.0, 1e-3, 11, n=250)
     return loop, cid.Record(r=record.r, u=record.u, y=record.y, dt=DT, name="log",
                             units={"r": "deg", "u": "%", "y": "deg"})  # fmt: skip
 
@@ -125,7 +125,7 @@ def test_an_output_in_degrees_of_an_angle_in_radians_gives_no_unit_to_forces(uni
         states=["theta", "omega"], params={"J": 0.5, "c": 0.1, "k": 1.0}, name="disc",
     )  # fmt: skip
     loop = cid.Loop(plant, cid.PID(kp=0.2, kd=0.02), dt=DT, free=("k",), units=units)
-    record = record_of(loop, E.CoulombFriction(3.0), 60.0, 0.02, 11, n=500)
+    record = record_of(loop, E.CoulombFriction(3.0), 60.0, 0.02, 11, n=300)
     record = cid.Record(r=record.r, u=record.u, y=record.y, dt=DT,
                         units={"r": "°", "u": "%", "y": "°"})  # fmt: skip
     found = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
