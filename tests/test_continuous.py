@@ -41,7 +41,7 @@ def loop_at(dt, analog=False, plant=PLANT):
     return cid.Loop(plant, C, dt=dt)
 
 
-def experiment(loop, n=4000, seed=1, hold=0.02, **noise):
+def experiment(loop, n=2000, seed=1, hold=0.02, **noise):
     held = max(1, round(hold / loop.dt))
     r = cid.random_binary(n, amplitude=1e-4, hold=held, seed=seed)
     return cid.simulate(loop, r, seed=seed + 100, **noise)
@@ -71,7 +71,7 @@ def test_offsets_and_units_do_not_matter():
 
 @pytest.mark.parametrize(("noise", "dt"), [
     ({"sensor_noise": 1e-5}, 0.005),
-    ({"sensor_noise": 1e-5}, 0.001),
+    pytest.param({"sensor_noise": 1e-5}, 0.001, marks=pytest.mark.slow),
     ({"sensor_noise": 2e-6, "force_noise": 0.05}, 0.002),
 ])  # fmt: skip
 def test_right_within_its_errors_under_feedback_where_least_squares_is_not(noise, dt):
@@ -127,7 +127,7 @@ def test_intervals_cover_as_promised(analog):
 def test_known_analog_controller_is_followed_between_the_samples():
     """At 5 ms the input of the lead moves within the period, and straight lines miss it."""
     loop = loop_at(0.005, analog=True)
-    clean = experiment(loop, n=2000)
+    clean = experiment(loop, n=1000)
     G = cid.fit_continuous(clean, 2, constraints=SYMMETRIC, controller=loop.controller)
     assert G.estimate["a2"] == pytest.approx(-ALPHA, rel=1e-6)
     assert G.estimate["b1"] == pytest.approx(-BETA, rel=1e-6)
@@ -137,7 +137,7 @@ def test_known_analog_controller_is_followed_between_the_samples():
     with pytest.warns(cid.CtrlidWarning, match="fastest pole of the controller times dt is 1"):
         cid.fit_continuous(replace(clean, r=None), 2, constraints=SYMMETRIC,
                            controller=loop.controller)  # fmt: skip
-    noisy = experiment(loop, n=2000, sensor_noise=1e-5)
+    noisy = experiment(loop, n=1000, sensor_noise=1e-5)
     e = cid.fit_continuous(noisy, 2, constraints=SYMMETRIC, controller=loop.controller).estimate
     assert abs(e["a2"] + ALPHA) < 4 * e.standard_errors[1]
 
@@ -159,7 +159,7 @@ def test_delay_is_estimated_on_request(delay):
     fine = 50  # the exact delayed input at a fifty times finer period
     plant = ct.tf([4.0], [1, 3.0, 2.0])
     rng = np.random.default_rng(1)
-    u = np.repeat(rng.choice([-1.0, 1.0], 600), 5)
+    u = np.repeat(rng.choice([-1.0, 1.0], 300), 5)
     shifted = np.repeat(u, fine)
     shift = round((late + part) * fine)
     shifted = np.concatenate([np.full(shift, u[0]), shifted[: len(shifted) - shift]])
@@ -228,7 +228,7 @@ def test_a_decimated_record_is_called_that():
 
 
 def test_constraints_hold_exactly():
-    record = experiment(loop_at(0.005), n=1500, sensor_noise=1e-5)
+    record = experiment(loop_at(0.005), n=800, sensor_noise=1e-5)
     G = cid.fit_continuous(record, 2, constraints=[*SYMMETRIC, cid.StaticGain(0.004)])
     assert G.estimate["b1"] / G.estimate["a2"] == pytest.approx(0.004, rel=1e-12)
     bounded = cid.fit_continuous(record, 2, constraints=[*SYMMETRIC, cid.Bounds("b1", -6.0, 0.0)])
