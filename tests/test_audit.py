@@ -74,7 +74,7 @@ NEVER = ("saturation", "dropped samples", "outliers", "quantization")
 
 @pytest.fixture(scope="module")
 def healthy():
-    return random_records(110, seed=1)
+    return random_records(55, seed=1)
 
 
 def test_healthy_records_are_left_in_peace(healthy):
@@ -87,7 +87,7 @@ def test_healthy_records_are_left_in_peace(healthy):
         assert len(said) == 1
         assert all("computes from r and y" in f.text for f in said)
     assert named == []
-    assert len(harmful) <= 1, harmful  # one drift in a few hundred records is chance
+    assert harmful == []  # one drift in a few hundred records would be chance
 
 
 def clip_y(rng, record):
