@@ -70,6 +70,8 @@ def test_magnetoshield_needs_the_delay_and_the_lag(levitations):
     assert np.ptp(second) > 15
 
 
+# The test before asks of the same records, and test_each.py of trends.
+@pytest.mark.slow
 def test_magnetoshield_is_as_fast_at_every_gap(levitations, capsys):
     """The continuous fit, free of the bias: one pair at all set-points, though the gaps differ."""
     series = levitations.set_points()

@@ -282,12 +282,16 @@ def test_the_table_counts_and_the_file_keeps(tmp_path):
     assert "no draw" not in summary
 
 
-def test_an_input_that_is_swallowed_whole_is_told_and_counted_apart():
-    """No record tells what keeps all of an input away; the table counts with and without those."""
+@pytest.mark.slow
+def test_an_input_that_is_swallowed_whole_is_told():
     whole, most = (cases.draw_case("one", seed, 1500) for seed in (84503, 84546))
     assert [c.hidden for c in (whole, most)] == [("InputDeadZone",)] * 2
     assert whole.sizes[0]["deadzone"] > np.ptp(whole.u)
     assert (whole.swallowed, most.swallowed) == (True, False)
+
+
+def test_an_input_that_is_swallowed_whole_is_counted_apart():
+    """No record tells what keeps all of an input away; the table counts with and without those."""
     lines = [
         make_line("one", 0, ["InputDeadZone"], [200.0], swallowed=True, idle=True),
         make_line("one", 1, ["InputDeadZone"], [200.0], swallowed=False, idle=True),
