@@ -35,7 +35,7 @@ def seen_in(loop, record):
 
 def test_nothing_is_seen_where_a_parameter_is_one_number():
     loop = breathing()
-    found = [seen_in(loop, record_of(loop, seed)) for seed in range(9700, 9716)]
+    found = [seen_in(loop, record_of(loop, seed, n=3000)) for seed in range(9700, 9716)]
     names = [k for k in found[0] if k.startswith("constancy of k over ") or k == "rhythm of k"]
     assert len(names) == 7  # time, input, its change, position, velocity, reference; a rhythm
     p = np.array([[f[k] for k in names] for f in found])
@@ -79,7 +79,7 @@ def test_a_force_law_that_is_only_nearly_right_shows_in_its_parameter():
 
 
 def test_a_diagnosis_is_not_clean_where_a_gain_breathes():
-    record = record_of(breathing(rhythm=0.03), 9740, n=2500)
+    record = record_of(breathing(rhythm=0.03), 9740, n=2000)
     found = cid.diagnose(breathing(), record, progress=False,
                          catalogue=[E.CoulombFriction, E.ActuatorLag])  # fmt: skip
     assert found.verdict == "unknown"

@@ -14,7 +14,7 @@ KP, KI, KD = 30.0, 20.0, 4.0
 LIMIT = 2.0
 
 
-def record_servo(fault="", noise=1e-3, seed=0, n=2500, dither=0.0, pulses=0.0):
+def record_servo(fault="", noise=1e-3, seed=0, n=1250, dither=0.0, pulses=0.0):
     """A mass on a spring under a PD controller with one fault, in plain numpy."""
     rng = np.random.default_rng(seed)
     m, c, k = rng.uniform(0.8, 1.2), rng.uniform(1, 3), rng.uniform(-4, 4)

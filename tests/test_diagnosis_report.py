@@ -733,7 +733,7 @@ def test_predictions_at_some_samples_are_counted_as_a_part_of_those_kept_back(fo
 
 def test_a_rejected_law_is_said_to_make_the_gap_one_of_predictions(tmp_path):
     loop = drive()
-    record = record_of(loop, swing=0.1, hold=60, n=600, seed=1, sensor_noise=1e-4)
+    record = record_of(loop, swing=0.1, hold=60, n=400, seed=1, sensor_noise=1e-4)
     other = replace(loop, controller=cid.PID(kp=4.0, ki=4.0, kd=0.3, filter_time=0.02))
     words = ("The law of the controller is rejected, since it is not what computed the logged "
              "input, so that this gap is that of predictions, which use")  # fmt: skip

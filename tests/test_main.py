@@ -22,7 +22,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def run(*arguments):
-    return command.main(["--samples", "3000", "--seed", "1", "--quiet", *arguments])
+    return command.main(["--samples", "1500", "--seed", "1", "--quiet", *arguments])
 
 
 def test_the_whole_story(folder, capsys):
@@ -36,7 +36,7 @@ def test_the_whole_story(folder, capsys):
         "A steel ball of 21.3 g hangs below a magnet",
         "so the ball can be identified in closed loop only",
         "finds the lead with a crossover of 130 rad/s and a phase margin of 60 degrees",
-        "The record has 3000 samples",
+        "The record has 1500 samples",
         "The result is a2 = 1",
         "gives the right structure, but does not remove the bias under feedback",
         "the share of the variance of its error that noise explains",
@@ -45,8 +45,8 @@ def test_the_whole_story(folder, capsys):
         "Constrained: The model promises a phase margin of 50.0 deg at 120 rad/s; achieved",
         "Instruments: The model promises a phase margin of 50.0 deg at 120 rad/s; achieved",
         "The same ball hangs at a gap of 12 mm",
-        "3000 samples, one every 2 ms",
-        "Diagnosis of maglev (3000 samples, dt = 0.002 s)",
+        "1500 samples, one every 2 ms",
+        "Diagnosis of maglev (1500 samples, dt = 0.002 s)",
         "what is missing",
         "The hidden effect was InputDelay: delay = 0.00",
         "It was found, and no alternative was named.",
