@@ -9,11 +9,7 @@ import numpy as np
 
 from .._base.criterion import bayesian_penalty
 from .._base.errors import ModelCannotRun
-from .._base.statistics import (
-    compute_lagged_products,
-    compute_predicted_likelihood,
-    rounding_variance,
-)
+from .._base.statistics import rounding_variance
 from ..data.converter_grid import find_grid_step
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
@@ -26,7 +22,7 @@ from ..estimation.likelihood.noise.orders import measure_walk_gain
 from ..estimation.likelihood.tails import JointTails
 from .candidates import Trial
 from .fitted_model import Model, with_linearization
-from .noise_tests import run_noise_tests
+from .noise_tests import measure_colour_promise, run_noise_tests
 from .thresholds import THRESHOLD
 
 
@@ -138,16 +134,10 @@ def rings_at_line(fit: Fit, effect: AbstractEffect) -> bool:
 def _may_be_coloured(fit: Fit, more: float) -> bool:
     """Whether coloured sensor noise can gain more than so much, in place of a coloured force.
 
-    What past innovations tell of the next one is what a colour of the noise can explain; with
-    parameters that move along it may be twice as much. A slow walk of the sensor tells hardly
-    anything from one innovation to the next, the less beside a coloured force that follows it.
+    A slow walk of the sensor tells hardly anything from one innovation to the next, the less beside
+    a coloured force that follows it.
     """
-    told = 0.0
-    for z in fit.standardized:
-        filled = np.nan_to_num(z)
-        products = compute_lagged_products(filled, filled, THRESHOLD.lags)
-        told += compute_predicted_likelihood(products, float(np.count_nonzero(np.isfinite(z))))
     least = bayesian_penalty(1 - 2 * bool(fit.noise.drift), fit.size)
-    if THRESHOLD.colour_promise * told > more + least:
+    if measure_colour_promise(fit) > more + least:
         return True
     return THRESHOLD.colour_promise * measure_walk_gain(fit) > more

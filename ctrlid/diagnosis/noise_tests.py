@@ -13,6 +13,7 @@ from .._base.arrays import Array
 from .._base.statistics import (
     autocorrelation_time,
     compute_lagged_products,
+    compute_predicted_likelihood,
     kurtosis_about_zero,
     portmanteau,
 )
@@ -400,3 +401,17 @@ def _test_bins(z: Array, values: Array, slopes: Array, fit: Fit) -> tuple[float,
         by_mean,
         float(stats.chi2.sf(chi_square, use.sum() - 1)),
     )
+
+
+def measure_colour_promise(fit: Fit) -> float:
+    """Return how much coloured sensor noise may gain beside a model.
+
+    What past innovations tell of the next one is what a colour of the noise can explain; with
+    parameters that move along it may be twice as much.
+    """
+    told = 0.0
+    for z in fit.standardized:
+        filled = np.nan_to_num(z)
+        products = compute_lagged_products(filled, filled, THRESHOLD.lags)
+        told += compute_predicted_likelihood(products, float(np.count_nonzero(np.isfinite(z))))
+    return THRESHOLD.colour_promise * told

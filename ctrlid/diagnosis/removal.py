@@ -56,7 +56,7 @@ def weigh_effects(
     best = steps[0].best
     alone = len(model.loop.effects) == given + 1 and len(steps) <= 2
     alone = alone and best is not None and list(best.model.names) == list(model.names)
-    if alone and best is not None and has_same_noise(best.model, model):
+    if alone and best is not None and _is_as_fitted(best.model, model):
         return model, (Weighed(best, (), steps[0].base, given),)
     one = fuse_effects(model, given, steps)
     if one is not model:
@@ -69,6 +69,11 @@ def weigh_effects(
         found.append(Weighed(mine, (), smaller, position))
     found.sort(key=lambda f: -f.trial.gain)
     return model, tuple(found)
+
+
+def _is_as_fitted(one: Model, other: Model) -> bool:
+    """Whether two models of the same effects differ in values alone."""
+    return one.loop.sharpness == other.loop.sharpness and has_same_noise(one, other)
 
 
 def has_same_noise(one: Model, other: Model) -> bool:

@@ -188,12 +188,16 @@ def compare_effects(
         if rest and not has_same_noise(smaller, now):
             bare = refit_without_effect(now, place)[0]
 
-        def refit(t: Trial, bare: Model = bare, now: Model = now) -> Trial:
+        def refit(t: Trial, bare: Model = bare, now: Model = now, mine: Trial = mine) -> Trial:
             # From the model without the effect, whose values and noise stand for it, a rival may
             # stay short of its place, and so it may from the model with it.
             start = screen_at(bare, t.fitted if t.net_gain > THRESHOLD.gate else t.effect)
-            both = [refit_candidate(bare, start, near) for near in (None, now)]
-            return order_trial(bare, max(both, key=lambda t: t.net_gain), given)
+            tried = [refit_candidate(bare, start, near) for near in (None, now)]
+            if contains(t.effect, mine.effect):
+                # One that contains the effect is as likely where it begins as that.
+                same = screen_at(bare, replace(t.effect, **mine.fitted.values()))
+                tried.append(refit_candidate(bare, same, now))
+            return order_trial(bare, max(tried, key=lambda t: t.net_gain), given)
 
         again = work(refit, rest)
         again = [_count_from(t, bare, smaller) for t in again]

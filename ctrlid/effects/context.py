@@ -18,7 +18,7 @@ SHARPEST = 1e-12
 # A lag shorter than this share of a sampling period is treated as that long, so that its rate stays
 # finite.
 INSTANT = 1e-6
-# A mass comes to rest within this share of a sampling period: samples cannot show how it sticks.
+# A mass comes to rest within this share of a sampling period, or sooner in a sharper loop.
 STICKING = 0.25
 # Friction creeps with the velocity that this share of its limit needs, where more is asked for.
 LARGEST_SHARE = 0.99
@@ -281,13 +281,13 @@ class Moment:
 
         .. math::
             f = f_c \, E[\mathrm{sign}(v + \tau b)],
-            \quad b = \frac{a}{(1 + (a / f_c)^8)^{1/8}}, \quad \tau = T / 4
+            \quad b = \frac{a}{(1 + (a / f_c)^8)^{1/8}}, \quad \tau = T / 4 s
 
         The jump is spread over velocities of the size :math:`\sqrt{2/\pi} \, \tau f_c`, so that
         near rest f is :math:`v / \tau + b`: it balances what else accelerates the mass, a, up to
-        its limit, and takes the velocity away within a quarter of a sampling period T. This is
-        Karnopp's friction without a switch: the mass sticks, and nothing is too sharp for an
-        integration.
+        its limit, and takes the velocity away within a quarter of a sampling period T, or s times
+        as fast where the loop has the `sharpness` s. This is Karnopp's friction without a switch:
+        the mass sticks, and nothing is too sharp for an integration.
 
         With a time of creep :math:`\tau_c` it is the friction
         :math:`f_c \tanh(v / (\tau_c f_c))` that simulations are often written with. It holds no
@@ -296,7 +296,7 @@ class Moment:
 
         .. math::
             f = f_c \, E[\mathrm{sign}(v + \lambda (\tau b - v_c))],
-            \quad \tau = \sqrt{(T/4)^2 + \tau_c^2}, \quad \lambda = (T / 4 \tau)^2
+            \quad \tau = \sqrt{(T/4s)^2 + \tau_c^2}, \quad \lambda = (T / 4 s \tau)^2
 
         which needs no small steps where the creep is slow, and is the friction itself where it is
         fast.

@@ -95,6 +95,10 @@ class Loop(Printed):
         else each velocity is pushed alone. A state that is a speed, though its position is no
         state, becomes a velocity in this way: a motor with a tachometer, ``{"omega": "tau"}``, or
         ``{"omega": None}`` where no input is its torque, may then have friction.
+    sharpness : float, optional
+        How many times faster than in a quarter of a sampling period dry friction and stops among
+        the effects bring a mass to rest, 1 or more. Friction is never more abrupt than that, and
+        takes smaller steps of the integration with it. A diagnosis finds out what a record wants.
 
     Raises
     ------
@@ -121,6 +125,7 @@ class Loop(Printed):
     units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     driven: tuple[str, ...] = field(default=(), kw_only=True)
     forces: Mapping[str, str | None] | None = field(default=None, kw_only=True)
+    sharpness: float = field(default=1.0, kw_only=True)
     _traced: Equations = field(init=False, repr=False)
     _active: Equations = field(init=False, repr=False)
     _kept: Equations = field(init=False, repr=False)
@@ -129,6 +134,11 @@ class Loop(Printed):
         if not (is_number(self.dt) and 0 < self.dt < math.inf):
             raise CtrlidError("a loop needs its sampling period dt > 0 s, as in Loop(plant, "
                               f"controller, dt=0.001); given dt={self.dt!r}")  # fmt: skip
+        if not (is_number(self.sharpness) and 1 <= self.sharpness < math.inf):
+            raise CtrlidError(
+                "sharpness= says how many times faster than in a quarter of a sampling period "
+                f"friction stops a mass, 1 or more; given {self.sharpness!r}"
+            )
         equations, inputs = self._trace_plant()
         # A loop is a value: its equations are those of the plant at the time it was made.
         object.__setattr__(self, "_traced", equations)
@@ -193,13 +203,12 @@ class Loop(Printed):
             return whole, names
         return drive_inputs(whole, driven or names, forces or {}, units), names
 
-    def _apply_effects(self, like: "Loop | None" = None, period: float | None = None) -> None:
+    def _apply_effects(self, like: "Loop | None" = None) -> None:
         """Put the effects into the equations and see that the free parameters exist.
 
-        Where a loop `like` this one has the same effects at work, its equations are taken over. The
-        `period` that effects are told of is the sampling period by default.
+        Where a loop `like` this one has the same effects at work, its equations are taken over.
         """
-        period = self.dt if period is None else period
+        period = self.dt / self.sharpness
         effects = check_effects(self.effects)
         object.__setattr__(self, "effects", effects)
         plant, at = self._shift_to_absolute(), self._bare_point
@@ -229,7 +238,7 @@ class Loop(Printed):
             [(k, id(e)) for k, e in x.labelled.items() if not e.neutral] for x in (self, other)
         )
         plant = self._traced is other._traced and self.at is other.at and self.dt == other.dt
-        return plant and mine == its
+        return plant and mine == its and self.sharpness == other.sharpness
 
     @property
     def linear_plant(self) -> bool:
@@ -557,6 +566,8 @@ class Loop(Printed):
             text += f", free: {', '.join(names)}"
         if self.effects:
             text += f", effects: {', '.join(self.labelled)}"
+        if self.effects and self.sharpness != 1:
+            text += f", sharpness {self.sharpness:g}"
         wiring = self.wiring
         if wiring is None:
             return text + ")"
@@ -674,8 +685,7 @@ def sharpen_effects(loop: Loop, times: float) -> Loop:
     The last ones are kept: replicas are simulated with one loop again and again.
 
     Dry friction takes a mass to rest within a share of a period, and a parameter steps within half
-    of one. That keeps a filter fast; nature does not wait for samples. The copy is there to be
-    simulated: what is made of it is as the loop was.
+    of one. That keeps a filter fast; nature does not wait for samples.
 
     Parameters
     ----------
@@ -691,8 +701,4 @@ def sharpen_effects(loop: Loop, times: float) -> Loop:
     """
     if not loop.effects:
         return loop
-    new = object.__new__(Loop)
-    new.__dict__.update(loop.__dict__)
-    # The period enters the formulas of the effects, which take a plain number only.
-    new._apply_effects(period=float(loop.dt / times))
-    return new
+    return loop._replace_fields(sharpness=float(times))

@@ -10,7 +10,7 @@ from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
-from ...loop.loop import replace_effect_values
+from ...loop.loop import replace_effect_values, sharpen_effects
 from .filter_data import prepare_for_loop
 from .kalman_filter import (
     Noise,
@@ -90,6 +90,8 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
     """
     noise = problem.known.noise if problem.known else noise
     theta = list_start_values(problem.plant.loop, problem.plant.names) if theta is None else theta
+    if problem.plant.loop.sharpness > 1 and problem.plant.e.kinked:
+        return _begin_with_abrupt_friction(problem, theta, noise)
     beside = bool(problem.plant.loop.effects)
     found = []
     try:
@@ -108,6 +110,31 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
         if not found:
             raise
     return max(found, key=rank_by_likelihood)
+
+
+def _begin_with_abrupt_friction(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
+    """Return the starting point with friction that is made twice as abrupt again and again.
+
+    From a guess a trajectory does not settle where friction is abrupt; it does from one along which
+    that is half as abrupt.
+    """
+    plant = problem.plant
+    sharpness, fit = 1.0, begin_fit(_replace_sharpness(problem, 1.0), theta, noise)
+    while sharpness < plant.loop.sharpness:
+        sharpness = min(2 * sharpness, plant.loop.sharpness)
+        there = _replace_sharpness(fit.problem, sharpness)
+        fit = evaluate_likelihood(there, theta, fit.noise, fit.trajectories)
+        fit = relinearize_fit(fit)
+    return evaluate_likelihood(
+        replace(fit.problem, plant=plant), theta, fit.noise, fit.trajectories
+    )
+
+
+def _replace_sharpness(problem: Problem, sharpness: float) -> Problem:
+    plant = problem.plant
+    return replace(
+        problem, plant=plant.of_loop(sharpen_effects(plant.loop, sharpness), plant.names)
+    )
 
 
 def _stays_inside_domain(fit: Fit) -> bool:

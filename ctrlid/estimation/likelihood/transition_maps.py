@@ -161,15 +161,16 @@ def choose_scheme(e: Equations, loop: Loop, dt: float, law: ControlLaw | None = 
         return Scheme(8, 2, (8, 2) if cut else None)
     # Under whatever controller, a plant that is too fast is refused below.
     if law is not None and rate / 1.5 <= MOST_STEPS:
-        return _choose_scheme_under_law(e, rate_under_law)
+        return _choose_scheme_under_law(e, rate_under_law, loop.sharpness)
     if rate <= 3 * SLOW:
         # A velocity that turns within a period crosses the kink of friction there.
-        few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW))
+        kink = max(KINK_STEPS, math.ceil(2 * loop.sharpness))
+        few = max(kink if e.kinked else 1, math.ceil(rate / SLOW))
         if not driven:
             return Scheme(4, few)
         # A higher order does not help beside a kink.
         if cut and e.kinked:
-            return Scheme(4, few, (4, SHARP_STEPS))
+            return Scheme(4, few, (4, max(SHARP_STEPS, math.ceil(3 * loop.sharpness))))
         # What a lag of the input does is known exactly; the plant has to follow it.
         few = max(
             2 * few if e.kinked else few,
@@ -188,14 +189,15 @@ def choose_scheme(e: Equations, loop: Loop, dt: float, law: ControlLaw | None = 
     return Scheme(8, steps, (8, steps) if cut else None)
 
 
-def _choose_scheme_under_law(e: Equations, rate: float) -> Scheme:
+def _choose_scheme_under_law(e: Equations, rate: float, sharpness: float) -> Scheme:
     """Return the scheme of a plant and its analog controller, which move together.
 
     A lag has no exact formula there, and is a state as others are.
     """
     if rate > 3 * SLOW:
         return Scheme(8, min(max(2, math.ceil(rate / 1.5)), MOST_STEPS_UNDER_LAW))
-    few = max(KINK_STEPS if e.kinked else 2, math.ceil(rate / SLOW))
+    kink = max(KINK_STEPS, math.ceil(2 * sharpness))
+    few = max(kink if e.kinked else 2, math.ceil(rate / SLOW))
     return Scheme(4, 2 * few if e.kinked and find_lags(e)[0] else few)
 
 
