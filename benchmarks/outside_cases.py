@@ -4,6 +4,8 @@ They share plants, controllers and noises with ``outside_rigs.py`` and know noth
 classes are
 
 - ``clean``: nothing is hidden in plant or sensor, under the nine noises;
+- ``rubbing``: the same of a plant with dry friction worth 50 to 30 000, which its model has as
+  well, of a size that is up to a fifth off and free;
 - ``one``: an effect of plant or sensor that is worth 50 to 30 000; ``faint``: one worth 5 to 50;
 - ``two``, ``three``: each worth 50 to 30 000, the last one beside the others;
 - ``outside``: worth 50 to 30 000, and in no catalogue;
@@ -29,9 +31,11 @@ import outside_rigs as rigs
 from outside_worth import LAWS, WHITE, Truth, measure_worth
 from scipy.signal import cont2discrete
 
-CLASSES = ("clean", "one", "faint", "two", "three", "outside", "parameter")
-WORTH = {"faint": (5.0, 50.0), "one": (50.0, 3e4), "two": (50.0, 3e4), "three": (50.0, 3e4),
-         "outside": (50.0, 3e4)}  # fmt: skip
+CLASSES = ("clean", "rubbing", "one", "faint", "two", "three", "outside", "parameter")
+WORTH = {"rubbing": (50.0, 3e4), "faint": (5.0, 50.0), "one": (50.0, 3e4), "two": (50.0, 3e4),
+         "three": (50.0, 3e4), "outside": (50.0, 3e4)}  # fmt: skip
+# How far the friction that a model has may be off, as a share.
+GIVEN_FRICTION = 0.2
 FREE = {
     "ball": ("K", "b"), "drive": ("k", "c", "b"), "pendulum": ("m", "c", "b"),
     "spring": ("s", "c", "b"), "cart": ("M", "b"), "tanks": ("o1", "o2", "k"),
@@ -123,6 +127,8 @@ class Case:
     redrawn: int
     # Whether nothing of the input reaches the plant, so that no record tells what keeps it away.
     swallowed: bool = False
+    # Dry friction that the model has as well [output unit/s^2], as its user gives it; zero: none.
+    friction: float = 0.0
 
 
 def make_array(plant: str, p: dict[str, float]) -> np.ndarray:
@@ -390,14 +396,17 @@ def draw_case(name: str, seed: int, n: int = 1500) -> Case:
     if name == "parameter":
         plants = [p for p, exact in EXACT.items() if exact]
         plant = plants[seed % len(plants)]
+    if name == "rubbing":
+        plant = MECHANICAL[seed % len(MECHANICAL)]
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, *name.encode(), attempt])
         rig = draw_rig(rng, plant)
         if rig is None:
             continue
         kinds = rigs.NOISES
-        white = name == "clean" and seed // len(op.PLANTS) % len(kinds) == 0
-        white = white or (name != "clean" and rng.random() < 0.5)
+        still = name in ("clean", "rubbing")
+        white = still and seed // len(op.PLANTS) % len(kinds) == 0
+        white = white or (not still and rng.random() < 0.5)
         kind = "white" if white else str(rng.choice(kinds[1:]))
         made = _fill_rig(rng, name, seed, rig, kind, n, attempt)
         if made is not None:
@@ -459,7 +468,7 @@ def _fill_rig(
         able = [k for k, where in host.items() if rig.plant in where]
         # Every name in turn, so that no class of effects is rare.
         first = able[(seed // len(op.PLANTS) + 5 * (seed % len(op.PLANTS))) % len(able)]
-        hidden = [first]
+        hidden = ["CoulombFriction" if name == "rubbing" else first]
         while len(hidden) < count:
             # A plant has one change of a parameter at most, and no two that are one.
             k = str(rng.choice(able))
@@ -491,9 +500,14 @@ def _fill_rig(
     still = op.simulate(plant, p, e, rig.at, x0, rig.num, rig.den, False, 0.0 * moves, pushes,
                         rig.sigma * noise, periods, step * rig.sigma, reach)[1]  # fmt: skip
     swallowed = bool(np.allclose(still, y, rtol=0.0, atol=1e-6 * rig.sigma))
+    friction = 0.0
+    if name == "rubbing":
+        # Nobody is asked for what the model has.
+        friction = sizes[0]["coulomb"] * (1 + GIVEN_FRICTION * float(rng.uniform(-1, 1)))
+        hidden, sizes, worth = [], [], []
     r = moves + rig.at[2] if rig.closed else moves + rig.at[1]
     return Case(name, seed, rig, kind, r, u, y, tuple(hidden), tuple(sizes), tuple(worth), wanted,
-                attempt, swallowed)  # fmt: skip
+                attempt, swallowed, friction)  # fmt: skip
 
 
 def _list_other_indices(values: dict[str, float], indices: list[int]) -> tuple[int, ...]:

@@ -18,6 +18,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,8 @@ from watched_numbers import watch_numbers
 
 import ctrlid as cid
 
-FULL = {"clean": 600, "one": 400, "faint": 400, "two": 200, "three": 15, "outside": 200,
-        "parameter": 100}  # fmt: skip
+FULL = {"clean": 600, "rubbing": 150, "one": 400, "faint": 400, "two": 200, "three": 15,
+        "outside": 200, "parameter": 100}  # fmt: skip
 SAMPLES = 1500
 FAINT, FOUND = 5.0, 50.0  # worth from which a wrong name counts, and from which an effect is due
 BESIDE = 100.0  # the same of each of two
@@ -91,8 +92,8 @@ SIZES: dict[str, tuple[str, Callable[[dict[str, float], float], float]]] = {
 }
 
 
-def make_loop(rig: cases.Rig) -> cid.Loop:
-    """Return the model that the user of a rig has."""
+def make_loop(rig: cases.Rig, friction: float = 0.0) -> cid.Loop:
+    """Return the model that the user of a rig has, with friction of a free size if one is given."""
     rates, states, entry, shown = MODELS[rig.plant]
     given = {k: v for k, v in rig.given.items() if k != "b" or "b" in cases.FREE[rig.plant]}
     plant = ct.nlsys(
@@ -106,7 +107,11 @@ def make_loop(rig: cases.Rig) -> cid.Loop:
     if rig.closed and rig.stated != "unknown":
         law = ct.tf((rig.stated_gain * rig.num).tolist(), rig.den.tolist(), rig.dt)
     free = {name: rig.deviation.get(name, math.inf) for name in cases.FREE[rig.plant]}
-    return cid.Loop(plant, law, dt=rig.dt, at=at, free=free)
+    loop = cid.Loop(plant, law, dt=rig.dt, at=at, free=free)
+    if not friction:
+        return loop
+    rubbing = loop.with_effect(cid.effects.CoulombFriction(fc=friction))
+    return replace(rubbing, free={**free, "CoulombFriction.fc": math.inf})
 
 
 def run(name: str, seed: int, n: int = SAMPLES, watched: bool = True) -> dict[str, Any]:
@@ -131,7 +136,7 @@ def run(name: str, seed: int, n: int = SAMPLES, watched: bool = True) -> dict[st
             "worth": [round(float(w), 3) for w in case.worth],
             "swallowed": case.swallowed, "drawing": round(time.process_time() - start, 2),
         }  # fmt: skip
-        loop = make_loop(rig)
+        loop = make_loop(rig, case.friction)
         record = cid.Record(r=case.r if rig.closed else None, u=case.u, y=case.y, dt=rig.dt)
         start = time.process_time()
         try:
@@ -336,6 +341,13 @@ def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
         ("findings, all classes: the gap wider beyond chance (1 %)", "never",
          write_share([is_wider(x) for x in drawn if list_sets(x)])),
     ]  # fmt: skip
+    if of["rubbing"]:
+        rows[3:3] = [
+            ("dry friction that the model has as well, nothing else hidden: any name", "<= 1 %",
+             write_share([bool(list_sets(x, stand_ins=True)) for x in of["rubbing"]])),
+            ('  the same: "nothing missing"', "",
+             write_share([x.get("verdict") == "nothing missing" for x in of["rubbing"]])),
+        ]  # fmt: skip
     off = [v for x in of["one"] + of["faint"] if (v := find_interval(x)) is not None]
     rows.append(("one effect, named first: the true size in its 95 % interval", ">= 90 %",
                  write_share([abs(v) < 1.96 for v in off])))  # fmt: skip
