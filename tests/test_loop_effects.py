@@ -136,7 +136,7 @@ def test_an_unknown_field_of_a_loop_is_refused_in_words():
     loop = levitated()
     with pytest.raises(cid.CtrlidError, match="Loop has no unit=; did you mean units="):
         replace(loop, unit={})
-    with pytest.raises(cid.CtrlidError, match=r"Loop has no K=; it takes plant, .*, forces$"):
+    with pytest.raises(cid.CtrlidError, match=r"Loop has no K=; it takes plant, .*, sharpness$"):
         cid.Loop(loop.plant, dt=0.01, at=loop.at, K=1.0)
     assert list(inspect.signature(cid.Loop).parameters)[:3] == ["plant", "controller", "dt"]
     with pytest.raises(cid.CtrlidError, match=r"no effect Coulomb; it has .*mean CoulombFriction"):

@@ -11,7 +11,7 @@ from ..estimation.likelihood.maximization import hold_force_quiet, maximize
 from ..estimation.likelihood.noise.orders import try_coloured_sensor
 from ..loop.loop import sharpen_effects
 from .fitted_model import Model, carry_over_fit, compute_criterion, with_linearization
-from .noise_tests import measure_colour_promise
+from .noise_tests import measure_colour_promise, run_noise_tests
 from .refitting import climb
 from .thresholds import THRESHOLD
 
@@ -33,7 +33,8 @@ def sharpen_friction(model: Model) -> Model:
     Returns
     -------
     Model
-        A sharper one if that is more probable by more than the gate; else the model as it is.
+        A sharper one if that is more probable by more than the gate, and leaves noise where the
+        model does; else the model as it is.
     """
     fit = model.fit
     if not fit.plant.e.kinked or fit.known is not None or not math.isfinite(fit.value):
@@ -47,7 +48,10 @@ def sharpen_friction(model: Model) -> Model:
     best = _double_while_likelier(max(begun, key=compute_criterion), climb)
     if not compute_criterion(best) > compute_criterion(model) + THRESHOLD.gate:
         return model
-    return with_linearization(Model(sharpen_effects(model.loop, best.loop.sharpness), best.fit))
+    sharper = with_linearization(Model(sharpen_effects(model.loop, best.loop.sharpness), best.fit))
+    # Beside a large random force, a filter errs more with abrupt friction than with blunt.
+    worse = run_noise_tests(model.fit).passed and not run_noise_tests(sharper.fit).passed
+    return model if worse else sharper
 
 
 def _double_while_likelier(model: Model, improve: Callable[[Fit], Fit]) -> Model:

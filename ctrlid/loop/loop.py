@@ -96,9 +96,9 @@ class Loop(Printed):
         state, becomes a velocity in this way: a motor with a tachometer, ``{"omega": "tau"}``, or
         ``{"omega": None}`` where no input is its torque, may then have friction.
     sharpness : float, optional
-        How many times faster than in a quarter of a sampling period dry friction and stops among
-        the effects bring a mass to rest, 1 or more. Friction is never more abrupt than that, and
-        takes smaller steps of the integration with it. A diagnosis finds out what a record wants.
+        The factor by which dry friction and stops among the effects bring a mass to rest faster
+        than in a quarter of a sampling period: 1, or more. A diagnosis finds out what a record
+        wants.
 
     Raises
     ------
