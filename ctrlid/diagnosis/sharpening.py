@@ -5,6 +5,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from .._base.errors import ModelCannotRun
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import hold_force_quiet, maximize
@@ -33,8 +35,8 @@ def sharpen_friction(model: Model) -> Model:
     Returns
     -------
     Model
-        A sharper one if that is more probable by more than the gate, and leaves noise where the
-        model does; else the model as it is.
+        A sharper one if that is more probable by more than the gate, leaves less to random forces
+        and passes the tests where the model does; else the model as it is.
     """
     fit = model.fit
     if not fit.plant.e.kinked or fit.known is not None or not math.isfinite(fit.value):
@@ -48,10 +50,18 @@ def sharpen_friction(model: Model) -> Model:
     best = _double_while_likelier(max(begun, key=compute_criterion), climb)
     if not compute_criterion(best) > compute_criterion(model) + THRESHOLD.gate:
         return model
+    # What friction mends was left to a random force. One that grows mends something else.
+    if not _measure_force(best.fit) < _measure_force(fit):
+        return model
     sharper = with_linearization(Model(sharpen_effects(model.loop, best.loop.sharpness), best.fit))
     # Beside a large random force, a filter errs more with abrupt friction than with blunt.
-    worse = run_noise_tests(model.fit).passed and not run_noise_tests(sharper.fit).passed
+    worse = run_noise_tests(fit).passed and not run_noise_tests(sharper.fit).passed
     return model if worse else sharper
+
+
+def _measure_force(fit: Fit) -> float:
+    """Return the variance of all random forces, white and coloured [input of the force^2]."""
+    return float(np.mean(fit.sensor)) * (sum(fit.noise.force) + fit.noise.coloured)
 
 
 def _double_while_likelier(model: Model, improve: Callable[[Fit], Fit]) -> Model:
