@@ -164,13 +164,13 @@ def choose_scheme(e: Equations, loop: Loop, dt: float, law: ControlLaw | None = 
         return _choose_scheme_under_law(e, rate_under_law, loop.sharpness)
     if rate <= 3 * SLOW:
         # A velocity that turns within a period crosses the kink of friction there.
-        kink = max(KINK_STEPS, math.ceil(2 * loop.sharpness))
+        kink = _count_kink_steps(loop.sharpness)
         few = max(kink if e.kinked else 1, math.ceil(rate / SLOW))
         if not driven:
             return Scheme(4, few)
         # A higher order does not help beside a kink.
         if cut and e.kinked:
-            return Scheme(4, few, (4, max(SHARP_STEPS, math.ceil(3 * loop.sharpness))))
+            return Scheme(4, few, (4, SHARP_STEPS * kink // KINK_STEPS))
         # What a lag of the input does is known exactly; the plant has to follow it.
         few = max(
             2 * few if e.kinked else few,
@@ -189,6 +189,14 @@ def choose_scheme(e: Equations, loop: Loop, dt: float, law: ControlLaw | None = 
     return Scheme(8, steps, (8, steps) if cut else None)
 
 
+def _count_kink_steps(sharpness: float) -> int:
+    """Return how many steps of order four resolve friction that is so many times as abrupt.
+
+    A step is at most twice the time in which friction stops a mass; it is stable up to 2.8 times.
+    """
+    return max(KINK_STEPS, math.ceil(KINK_STEPS * sharpness / 2))
+
+
 def _choose_scheme_under_law(e: Equations, rate: float, sharpness: float) -> Scheme:
     """Return the scheme of a plant and its analog controller, which move together.
 
@@ -196,8 +204,7 @@ def _choose_scheme_under_law(e: Equations, rate: float, sharpness: float) -> Sch
     """
     if rate > 3 * SLOW:
         return Scheme(8, min(max(2, math.ceil(rate / 1.5)), MOST_STEPS_UNDER_LAW))
-    kink = max(KINK_STEPS, math.ceil(2 * sharpness))
-    few = max(kink if e.kinked else 2, math.ceil(rate / SLOW))
+    few = max(_count_kink_steps(sharpness) if e.kinked else 2, math.ceil(rate / SLOW))
     return Scheme(4, 2 * few if e.kinked and find_lags(e)[0] else few)
 
 
