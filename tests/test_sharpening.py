@@ -15,8 +15,9 @@ from ctrlid.diagnosis.fresh_data import choose_fresh_data
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.refitting import refit_candidate
 from ctrlid.diagnosis.screening import screen_at
-from ctrlid.diagnosis.sharpening import sharpen_friction
+from ctrlid.diagnosis.sharpening import sharpen_model
 from ctrlid.diagnosis.thresholds import THRESHOLD
+from ctrlid.estimation.likelihood.abrupt_friction import SHARPEST
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
 
@@ -71,13 +72,13 @@ def gain_of_second_friction(model):
 def sharpened():
     record = log_carriage(1)
     blunt = fit_with_friction(record)
-    return record, blunt, sharpen_friction(blunt)
+    return record, blunt, sharpen_model(blunt)
 
 
 def test_friction_becomes_as_abrupt_as_a_record_has_it(sharpened):
     """A filter's blunt friction lost 300 units, and a Stribeck curve that mends it gained 150."""
     _, blunt, sharp = sharpened
-    assert sharp.loop.sharpness == THRESHOLD.sharpest
+    assert sharp.loop.sharpness == SHARPEST
     assert compute_criterion(sharp) > compute_criterion(blunt) + 100
     assert gain_of_second_friction(blunt) > 50
     assert not gain_of_second_friction(sharp) > THRESHOLD.gate
@@ -88,13 +89,13 @@ def test_friction_becomes_as_abrupt_as_a_record_has_it(sharpened):
 
 def test_friction_that_is_blunt_stays_so():
     blunt = fit_with_friction(log_carriage(2, sticks=False))
-    assert sharpen_friction(blunt) is blunt
+    assert sharpen_model(blunt) is blunt
     bare = fit_base_model(model_of(), [log_carriage(2, n=300)], ("s", "c"))
-    assert sharpen_friction(bare) is bare
+    assert sharpen_model(bare) is bare
 
 
 def test_noise_that_hides_how_a_mass_sticks_asks_for_less(sharpened):
-    noisy = sharpen_friction(fit_with_friction(log_carriage(1, noise=5e-4)))
+    noisy = sharpen_model(fit_with_friction(log_carriage(1, noise=5e-4)))
     assert 1 < noisy.loop.sharpness < sharpened[2].loop.sharpness
 
 
@@ -137,3 +138,13 @@ def test_sharpness_belongs_to_the_loop():
     for wrong in (0.5, math.nan, math.inf, "2", True):
         with pytest.raises(CtrlidError, match="sharpness= says how many times faster"):
             model_of(sharpness=wrong)
+
+
+def test_fit_loop_knows_friction_as_well_as_the_record_does(sharpened):
+    """With blunt friction the errors were ten times as large, and a random force took the rest."""
+    record, blunt, _ = sharpened
+    names = ("s", "c", "CoulombFriction.fc")
+    fitted = cid.fit_loop(model_of(E.CoulombFriction(fc=0.9 * FRICTION), free=names), record)
+    assert fitted.loop.sharpness == SHARPEST
+    np.testing.assert_allclose(fitted.estimate.values, [STIFFNESS, DAMPING, FRICTION], rtol=1e-3)
+    assert fitted.estimate.standard_errors[2] < 0.2 * blunt.fit.standard_errors[2]

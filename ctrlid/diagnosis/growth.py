@@ -41,7 +41,7 @@ from .replicas import forgive_filter, make_replica
 from .rivals import compare_effects
 from .screening import screen_at
 from .selection import Round, run_round
-from .sharpening import sharpen_friction
+from .sharpening import sharpen_model
 from .thresholds import THRESHOLD
 
 
@@ -144,7 +144,7 @@ def _grow_model(
             reached.keep(steps[-1].base, steps[-1].best)
             reached.model = steps[-1].best.model
             model = refit_noise(order_last_effect(steps[-1].best.model, given))
-            model = sharpen_friction(drop_unseen_values(model, given))
+            model = sharpen_model(drop_unseen_values(model, given))
             model = with_linearization(drop_superfluous(model, given))
             likeliest = max(likeliest, model, key=compute_criterion)
             reached.note(model)

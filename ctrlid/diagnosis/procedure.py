@@ -62,7 +62,7 @@ from .removal import Weighed
 from .replicas import measure_rounding
 from .result import Diagnosis
 from .several_records import merge_diagnoses
-from .sharpening import sharpen_friction
+from .sharpening import sharpen_model
 from .thresholds import THRESHOLD
 from .verdict import declare_unfinished
 
@@ -283,7 +283,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     readout = read_limits(q.loop, q.records, q.audits, q.catalogue)
     # Step 2: a wrong value of a parameter is no missing effect.
     q.tell("recalibrating")
-    base = sharpen_friction(recalibrate(readout.loop, readout.records, q.audits))
+    base = sharpen_model(recalibrate(readout.loop, readout.records, q.audits))
     stepped = _add_steps(q, base)
     if stepped is not None:
         return _answer_question(stepped)

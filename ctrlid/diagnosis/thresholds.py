@@ -234,10 +234,6 @@ class Thresholds:
         unit="of log-likelihood",
     )  # fmt: skip
     replicas_beside_kink: int = declare_number(4, cost="so many of those replicas", unit="replicas")
-    sharpest: float = declare_number(
-        16.0, cost="friction of a model is at most so many times as abrupt as in the first filter",
-        unit="times",
-    )  # fmt: skip
     replica_sharpness: float = declare_number(
         16.0, study="friction in a replica is as abrupt as with a period so many times shorter; "
         "four times as sharp, and what mends a filter's friction gains 4 % more", unit="times",

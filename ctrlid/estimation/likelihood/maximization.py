@@ -119,10 +119,10 @@ def _begin_with_abrupt_friction(problem: Problem, theta: Array, noise: Noise | N
     that is half as abrupt.
     """
     plant = problem.plant
-    sharpness, fit = 1.0, begin_fit(_replace_sharpness(problem, 1.0), theta, noise)
+    sharpness, fit = 1.0, begin_fit(replace_sharpness(problem, 1.0), theta, noise)
     while sharpness < plant.loop.sharpness:
         sharpness = min(2 * sharpness, plant.loop.sharpness)
-        there = _replace_sharpness(fit.problem, sharpness)
+        there = replace_sharpness(fit.problem, sharpness)
         fit = evaluate_likelihood(there, theta, fit.noise, fit.trajectories)
         fit = relinearize_fit(fit)
     return evaluate_likelihood(
@@ -130,7 +130,8 @@ def _begin_with_abrupt_friction(problem: Problem, theta: Array, noise: Noise | N
     )
 
 
-def _replace_sharpness(problem: Problem, sharpness: float) -> Problem:
+def replace_sharpness(problem: Problem, sharpness: float) -> Problem:
+    """Return a problem whose friction is so many times as abrupt as that of the first filter."""
     plant = problem.plant
     return replace(
         problem, plant=plant.of_loop(sharpen_effects(plant.loop, sharpness), plant.names)

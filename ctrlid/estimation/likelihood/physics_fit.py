@@ -21,12 +21,13 @@ from ...data.several_records import (
     order_model_and_data,
 )
 from ...effects import ReadingEffect
-from ...loop.loop import Loop
+from ...loop.loop import Loop, sharpen_effects
 from ...loop.sampled_form import note_sampled_controller
 from ...loop.step_check import describe_unstated_steps
 from ...loop.unit_check import describe_distance, measure_distance, note_unit_clashes
 from ...physics.linearization import compute_state_matrices
 from ..whiteness import note_coloured_innovations
+from .abrupt_friction import sharpen_friction
 from .filter_data import find_noise_units, has_several_noises, name_noise_places
 from .likelihood import Fit, find_priors, list_effect_bounds, make_problem
 from .maximization import (
@@ -135,6 +136,7 @@ def fit_loop(
         asked = replace(loop, free=free) if isinstance(free, Mapping) else loop
         problem = replace(problem, priors=find_priors(asked, free))
     fit = refit_quiet_force(refit_noise_size(maximize(begin_fit(problem))))
+    fit = sharpen_friction(fit)
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
     fitted = summarize_fit(loop, fit) if math.isfinite(fit.value) else None
@@ -356,5 +358,6 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
         find_noise_units(loop, fit.problem.data[0].record),
         name_noise_places(loop) if several else ((), ()),
     )  # fmt: skip
-    fitted = loop.with_parameters(dict(zip(names, fit.theta.tolist(), strict=True)))
+    sharp = sharpen_effects(loop, fit.plant.loop.sharpness)
+    fitted = sharp.with_parameters(dict(zip(names, fit.theta.tolist(), strict=True)))
     return LoopFit(fitted, estimate)
