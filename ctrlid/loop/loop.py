@@ -97,8 +97,8 @@ class Loop(Printed):
         ``{"omega": None}`` where no input is its torque, may then have friction.
     sharpness : float, optional
         The factor by which dry friction and stops among the effects bring a mass to rest faster
-        than in a quarter of a sampling period: 1, or more. A diagnosis finds out what a record
-        wants.
+        than in a quarter of a sampling period: 1, or more. `fit_loop` and `diagnose` find out
+        which makes a record most probable.
 
     Raises
     ------

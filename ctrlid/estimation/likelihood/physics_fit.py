@@ -69,7 +69,8 @@ def fit_loop(
     make the likelihood; noise of the sensor and of the force is estimated with the parameters. The
     filter uses the measured input only: feedback does not bias the estimate, and neither reference
     nor controller is needed. Sensitivities are exact derivatives of the traced equations.
-    Gross outliers of the sensor are left out, and a note says how many and where.
+    Gross outliers of the sensor are left out, and a note says how many and where. Dry friction is
+    made more abrupt, by the `sharpness` of the loop, where that makes the records more probable.
 
     Parameters
     ----------
