@@ -20,6 +20,7 @@ from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.estimation.likelihood.abrupt_friction import SHARPEST
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
+from ctrlid.loop.loop import sharpen_effects
 
 DT, PARTS = 0.02, 200
 # A carriage of 1 kg on a spring: stiffness [N/m], damping [N s/m] and dry friction [N].
@@ -128,6 +129,7 @@ def test_dry_friction_alone_is_named_alone():
 def test_sharpness_belongs_to_the_loop():
     loop = model_of(E.CoulombFriction(fc=1.0), sharpness=4.0)
     assert "sharpness 4" in repr(loop)
+    assert sharpen_effects(loop, 4.0) is loop
     for other in (loop.with_parameters(s=50.0), replace(loop, free=("s",)),
                   loop.with_effect(E.ViscousFriction(c=0.1))):  # fmt: skip
         assert other.sharpness == 4.0

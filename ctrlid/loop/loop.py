@@ -697,8 +697,8 @@ def sharpen_effects(loop: Loop, times: float) -> Loop:
     Returns
     -------
     Loop
-        The same loop with sharper effects; itself where it has none.
+        The same loop with sharper effects; itself where it has none, or where they are that sharp.
     """
-    if not loop.effects:
+    if not loop.effects or loop.sharpness == times:
         return loop
     return loop._replace_fields(sharpness=float(times))
