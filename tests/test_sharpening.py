@@ -6,12 +6,14 @@ from dataclasses import replace
 import control as ct
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid._base.errors import CtrlidError
 from ctrlid.diagnosis.fitted_model import compute_criterion
 from ctrlid.diagnosis.fresh_data import choose_fresh_data
+from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.refitting import refit_candidate
 from ctrlid.diagnosis.screening import screen_at
@@ -36,11 +38,11 @@ def model_of(*effects, free=("s", "c"), **options):
     return cid.Loop(plant, dt=DT, free=free, effects=effects, **options)
 
 
-def log_carriage(seed, n=700, noise=2e-5, sticks=True):
+def log_carriage(seed, n=700, noise=2e-5, sticks=True, memory=0.0):
     """What is logged of the carriage: a period in many parts, and friction as an impulse in each.
 
     It takes up to so much of the velocity, never more than there is. Without sticking it is the
-    friction that ctrlid begins with, over a quarter of a period.
+    friction that ctrlid begins with, over a quarter of a period. The noise may have a memory.
     """
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.normal(0.0, 2.0, n // 12 + 1), 12)[:n]
@@ -55,7 +57,9 @@ def log_carriage(seed, n=700, noise=2e-5, sticks=True):
             v += h * (u[k] - STIFFNESS * x - DAMPING * v)
             v = math.copysign(max(abs(v) - h * FRICTION, 0.0), v)
             x += h * v
-    return cid.Record(u=u, y=y + noise * rng.normal(size=n), dt=DT)
+    white = noise * rng.normal(size=n)
+    coloured = lfilter([math.sqrt(1 - memory**2)], [1.0, -memory], white)
+    return cid.Record(u=u, y=y + coloured, dt=DT)
 
 
 def fit_with_friction(record):
@@ -98,6 +102,17 @@ def test_friction_that_is_blunt_stays_so():
 def test_noise_that_hides_how_a_mass_sticks_asks_for_less(sharpened):
     noisy = sharpen_model(fit_with_friction(log_carriage(1, noise=5e-4)))
     assert 1 < noisy.loop.sharpness < sharpened[2].loop.sharpness
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_friction_is_found_beside_a_sensor_that_errs_alike_in_successive_readings(seed):
+    """Beside white noise a force of 2 N took the sensor's colour; no climb led from it to none."""
+    blunt = fit_with_friction(log_carriage(seed, noise=3e-3, memory=0.9))
+    quiet = sharpen_model(blunt)
+    assert compute_criterion(quiet) > compute_criterion(blunt) + 50
+    assert run_noise_tests(quiet.fit).passed
+    assert quiet.fit.noise.ar == pytest.approx((0.9,), abs=0.05)
+    np.testing.assert_allclose(quiet.fit.theta[1:], [DAMPING, FRICTION], rtol=0.03)
 
 
 def test_a_filter_finds_its_way_where_friction_is_abrupt(sharpened):

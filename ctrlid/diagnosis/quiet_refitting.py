@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
-from ..estimation.likelihood.likelihood import Fit, rank_by_likelihood, relinearize_fit
-from ..estimation.likelihood.maximization import hold_force_quiet, maximize
+from ..estimation.likelihood.likelihood import Fit, rank_by_likelihood
+from ..estimation.likelihood.maximization import maximize, maximize_under_quiet_force
 from ..estimation.likelihood.noise.fit import fit_noise
 from .candidates import NUMERICAL_FAILURES, Trial, Work, attempt_trial
 from .fitted_model import Model, carry_over_fit, with_linearization
@@ -45,10 +45,10 @@ def refit_quietly(base: Model, effects: Sequence[AbstractEffect], work: Work) ->
         # A coloured force leaves a white one of any size, which says nothing of how large one was.
         white = replace(fit.noise, memory=0.0, drift=0.0)
         fit = fit_noise(fit.problem, fit.theta, fit.linearized, white, wide=True)
-    held = relinearize_fit(hold_force_quiet(fit))
+    held = maximize_under_quiet_force(fit)
     if not math.isfinite(held.value):
         return []
-    quiet = with_linearization(Model(base.loop, maximize(held, exact=False)))
+    quiet = with_linearization(Model(base.loop, held))
     if quiet.fit.value > base.fit.value - THRESHOLD.gate:
         return []
     tried: list[Trial] = work(lambda effect: scan_candidate(quiet, effect), effects)

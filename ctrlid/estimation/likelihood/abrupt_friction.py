@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._base.errors import ModelCannotRun
 from .likelihood import Fit, evaluate_likelihood
-from .maximization import hold_force_quiet, maximize, replace_sharpness
+from .maximization import maximize, maximize_under_quiet_force, replace_sharpness
 from .noise.coordinates import compute_noise_criterion
 
 # Friction becomes at most so many times as abrupt as in the first filter, since each doubling
@@ -49,12 +49,10 @@ def sharpen_friction(
     """
     if not fit.plant.e.kinked or fit.known is not None or not math.isfinite(fit.value):
         return fit
-    quiet = maximize(hold_force_quiet(fit), exact=False)
+    quiet = maximize_under_quiet_force(fit)
     held = _double_while_likelier(quiet, lambda start: maximize(start, exact=False))
-    begun = [fit]
-    if held is not quiet:
-        freed = replace(held, problem=replace(held.problem, known=None))
-        begun += [climb(freed)] if free_noise is None else free_noise(freed)
+    freed = replace(held, problem=replace(held.problem, known=None))
+    begun = [fit, *([climb(freed)] if free_noise is None else free_noise(freed))]
     best = _double_while_likelier(max(begun, key=compute_noise_criterion), climb)
     likelier = compute_noise_criterion(best) > compute_noise_criterion(fit) + GAIN
     # What friction mends was left to a random force. One that grows mends something else.

@@ -58,6 +58,8 @@ SECOND_STEP_GAIN = 30.0
 OTHER_NOISE_GAIN = 2.0
 # A force is hardly any with so small a share of its variance.
 QUIET = 1e-4
+# On the way there it has these shares in turn.
+QUIETER = (1e-1, 1e-2, 1e-3, QUIET)
 # A trajectory has settled where linearizing along it changes the log-likelihood by less.
 SETTLED_VALUE = 1.0
 # Passes from a trajectory near the record to that of the model.
@@ -315,13 +317,21 @@ def climb_under_quiet_force(fit: Fit) -> Fit:
     leaves much to a force: the likelihood has a maximum with and one without it. From the former no
     climb leads to the latter while the noise is free.
     """
-    return replace(maximize(hold_force_quiet(fit), exact=False), problem=fit.problem)
+    return replace(maximize_under_quiet_force(fit), problem=fit.problem)
 
 
-def hold_force_quiet(fit: Fit) -> Fit:
-    """Return a fit whose noise is held, with hardly any random force."""
-    quiet = quieten_force(fit.noise)
-    return replace(fit, noise=quiet, problem=replace(fit.problem, known=Known(quiet)))
+def maximize_under_quiet_force(fit: Fit) -> Fit:
+    """Return the maximum under hardly any random force, with the noise held.
+
+    The force becomes quieter by and by, each climb begun where the one before it ended. Friction
+    that was fitted beside a large force makes a filter with hardly any lose the record at once.
+    """
+    noise = fit.noise
+    for share in QUIETER:
+        quieter = replace(noise, force=tuple(share * v for v in noise.force))
+        held = replace(fit, noise=quieter, problem=replace(fit.problem, known=Known(quieter)))
+        fit = maximize(held, exact=False)
+    return fit
 
 
 def quieten_force(noise: Noise) -> Noise:
