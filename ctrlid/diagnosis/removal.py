@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from .._base.criterion import bayesian_penalty
 from .._base.errors import ModelCannotRun
+from ..effects.base import name_with_subject
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.maximization import (
     begin_fit,
@@ -63,12 +64,33 @@ def weigh_effects(
         return weigh_effects(refit_noise(one), given, steps)
     found: list[Weighed] = []
     for position in range(given, len(model.loop.effects)):
-        smaller, mine = weigh_without_effect(model, position)
+        refitted, mine = weigh_without_effect(model, position)
+        smaller = _find_likeliest_passed(refitted, steps)
+        lost = compute_criterion(smaller) - compute_criterion(refitted)
+        mine = replace(mine, gain=mine.gain - lost) if lost > 0 else mine
         if mine.net_gain <= THRESHOLD.gate:
             return weigh_effects(refit_noise(smaller), given, steps)
         found.append(Weighed(mine, (), smaller, position))
     found.sort(key=lambda f: -f.trial.gain)
     return model, tuple(found)
+
+
+def _find_likeliest_passed(model: Model, steps: Sequence[Round]) -> Model:
+    """Return the likeliest model of the same effects that a search passed through.
+
+    Where an effect that is taken out had moved the others, a climb may end short of where they were
+    before it came.
+    """
+    tried = (t.model for s in steps for t in s.trials if t.out is None)
+    same = [
+        m for m in (*(s.base for s in steps), *tried)
+        if m.names == model.names and _name_effects(m) == _name_effects(model)
+    ]  # fmt: skip
+    return max([model, *same], key=compute_criterion)
+
+
+def _name_effects(model: Model) -> list[str]:
+    return [name_with_subject(effect) for effect in model.loop.effects]
 
 
 def _is_as_fitted(one: Model, other: Model) -> bool:

@@ -8,8 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from ..._base.errors import ModelCannotRun
-from .likelihood import Fit, evaluate_likelihood
-from .maximization import maximize, maximize_under_quiet_force, replace_sharpness
+from .likelihood import Fit, evaluate_likelihood, relinearize_fit
+from .maximization import (
+    maximize,
+    maximize_under_quiet_force,
+    quieten_force,
+    replace_sharpness,
+)
 from .noise.coordinates import compute_noise_criterion
 
 # Friction becomes at most so many times as abrupt as in the first filter, since each doubling
@@ -54,9 +59,11 @@ def sharpen_friction(
     freed = replace(held, problem=replace(held.problem, known=None))
     begun = [fit, *([climb(freed)] if free_noise is None else free_noise(freed))]
     best = _double_while_likelier(max(begun, key=compute_noise_criterion), climb)
-    likelier = compute_noise_criterion(best) > compute_noise_criterion(fit) + GAIN
-    # What friction mends was left to a random force. One that grows mends something else.
-    return best if likelier and _measure_force(best) < _measure_force(fit) else fit
+    # What friction mends was left to a random force. One that grows mends something else, and is
+    # not needed here.
+    quiet = replace(best, noise=quieten_force(best.noise))
+    best = best if _measure_force(best) < _measure_force(fit) else relinearize_fit(quiet)
+    return best if compute_noise_criterion(best) > compute_noise_criterion(fit) + GAIN else fit
 
 
 def _measure_force(fit: Fit) -> float:
@@ -65,12 +72,16 @@ def _measure_force(fit: Fit) -> float:
 
 
 def _double_while_likelier(fit: Fit, climb: Climb) -> Fit:
-    """Return a fit with friction twice as abrupt as often as that gains enough."""
+    """Return a fit with friction twice as abrupt as often as that may yet gain enough.
+
+    As often as it gains so much that all doublings would gain enough if each gained the same.
+    """
+    least = GAIN / math.log2(SHARPEST)
     while 2 * fit.plant.loop.sharpness <= SHARPEST:
         with contextlib.suppress(ModelCannotRun):
             there = replace_sharpness(fit.problem, 2 * fit.plant.loop.sharpness)
             sharper = climb(evaluate_likelihood(there, fit.theta, fit.noise, fit.trajectories))
-            if compute_noise_criterion(sharper) > compute_noise_criterion(fit) + GAIN:
+            if compute_noise_criterion(sharper) > compute_noise_criterion(fit) + least:
                 fit = sharper
                 continue
         break
