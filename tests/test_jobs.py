@@ -4,6 +4,7 @@ import os
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from ctrlid._base.jobs import count_processors, run_side_by_side
@@ -28,6 +29,19 @@ def test_two_items_are_in_work_at_a_time():
         return k
 
     assert run_side_by_side(meet, (1, 2)) == [1, 2]
+
+
+def test_threads_know_what_their_caller_has_told_numpy():
+    both = threading.Barrier(min(2, count_processors()))
+
+    def overflow(x):
+        both.wait(timeout=20)
+        return np.log(x)
+
+    with np.errstate(invalid="ignore"):
+        assert np.isnan(run_side_by_side(overflow, [np.float64(-1.0)] * both.parties)).all()
+    with np.errstate(invalid="raise"), pytest.raises(FloatingPointError):
+        run_side_by_side(overflow, [np.float64(-1.0)] * both.parties)
 
 
 def test_an_error_is_raised():

@@ -164,6 +164,12 @@ def test_a_line_of_the_reference_has_a_locked_phase():
     # Steps that repeat have lines at the multiples of one over their period.
     again = record(np.tile(steps(1)[: N // 8], 8))
     assert is_phase_locked(again, 3 / (N / 8 * DT))
+    # Lines may be close to each other, and a fitted frequency is not exact.
+    lines = (0.9, 1.7, 2.6)
+    several = record(sum(np.sin(2 * np.pi * f * t + f) for f in lines))
+    for f in lines:
+        assert is_phase_locked(several, f + 0.2 / (N * DT))
+    assert not is_phase_locked(several, 1.3)
 
 
 def test_a_line_at_a_frequency_of_the_reference_is_a_stand_in():

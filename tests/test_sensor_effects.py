@@ -130,12 +130,13 @@ def test_what_no_record_tells_apart_is_one_name():
     assert join_names([scale]) == "ConstantForce, SensorGain or the parameter g of the plant"
 
 
-def test_a_step_stays_within_the_record():
+def test_a_step_stays_within_the_record_and_a_parameter_keeps_its_sign():
     class Seen:
         dt, duration, travel, fastest = DT, 4.0, 1.0, 1.0
 
     step = E.ParameterStep("k", 2.0, 0.1)
-    assert step.limits(Seen) == {"time": (0.0, 4.0)}
+    assert step.limits(Seen) == {"time": (0.0, 4.0), "size": (-1.0, np.inf)}
+    assert E.ParameterDrift("k", 0.1).limits(Seen) == {"rate": (-0.25, np.inf)}
     assert next(p for p in step.parameters() if p.name == "time").searched
 
 

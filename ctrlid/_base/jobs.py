@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import functools
 import math
 import multiprocessing
@@ -17,6 +18,7 @@ from typing import Any, TypeVar
 
 from .errors import CtrlidError
 from .interruption import Budget, check_budget, check_interrupt, find_budget, lend_budget
+from .rounding import keep_numpy_quiet
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -111,7 +113,7 @@ def _call_elsewhere(
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     budget = Budget(left, samples=samples)
     with budget.running():
-        return function(item), budget.spent
+        return keep_numpy_quiet(function)(item), budget.spent
 
 
 def run_side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
@@ -155,8 +157,10 @@ def run_side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) 
                 raise
 
     help_out = lend_budget(take)
+    # A thread does not know by itself what its caller has told numpy of rounding and overflows.
     helpers = [
-        _start_threads().submit(help_out) for _ in range(min(count_processors(), len(given)) - 1)
+        _start_threads().submit(contextvars.copy_context().run, help_out)
+        for _ in range(min(count_processors(), len(given)) - 1)
     ]
     # The calling thread works too, while the others start.
     take()

@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
+from scipy.signal.windows import dpss
 
 from .._base.text import write_p_value, write_quantity
 from ..data.record import Record
@@ -156,13 +158,20 @@ def follows_the_reference(case: Case, f: Weighed) -> str:
 
 
 def is_phase_locked(record: Record, frequency: float) -> bool:
-    r"""Whether the reference has a line whose phase is constant over the record.
+    r"""Whether the reference has a line at a frequency, and not only power about it.
 
-    .. math:: S = \Bigl|\sum_b R_b\Bigr|^2 / \sum_b |R_b|^2, \quad p = (1 - S / B)^{B - 1}
+    .. math:: F = (K - 1) \frac{|\mu|^2 \sum_k U_k^2}{\sum_k |J_k - \mu U_k|^2}, \quad
+        \mu = \frac{\sum_k U_k J_k}{\sum_k U_k^2}
 
-    with the Fourier coefficients :math:`R_b` of the reference in B stretches, through a Hann window
-    which keeps other lines out. p is how often Gaussian coefficients of random phases line up so
-    well. A line that was fitted to the whole record has a constant phase itself.
+    with the Fourier coefficients :math:`J_k` of the reference through K orthogonal windows of sums
+    :math:`U_k`. Of a steady line each has its share; of power without a line they are independent,
+    and F has the distribution of Fisher with 2 and 2 K - 2 degrees of freedom. A line that was
+    fitted to the whole record has a constant phase itself. Its frequency is known to a part of what
+    a record resolves, and the likeliest frequency within that counts.
+
+    References
+    ----------
+    D. J. Thomson, Spectrum estimation and harmonic analysis, Proc. IEEE 70 (1982) 1055-1096.
     """
     if record.r is None or not is_line_of_reference(record, frequency):
         return False
@@ -173,13 +182,17 @@ def is_phase_locked(record: Record, frequency: float) -> bool:
         )
     keep = record.valid_samples & np.isfinite(record.r)
     r = np.where(keep, record.r - np.mean(record.r[keep]), 0.0)
-    wave = np.exp(-2j * np.pi * frequency * np.asarray(record.t))
-    parts = [np.sum(np.hanning(len(one)) * one) for one in np.array_split(r * wave, THRESHOLD.bins)]
-    size = float(np.sum(np.abs(parts) ** 2))
-    if size == 0:
-        return False
-    aligned = float(abs(np.sum(parts)) ** 2) / size / len(parts)
-    return (1 - min(aligned, 1.0)) ** (len(parts) - 1) < THRESHOLD.beyond_chance
+    count = THRESHOLD.tapers
+    windows = dpss(len(r), (count + 1) / 2, count)
+    sums = np.sum(windows, axis=1)
+    near = frequency + np.linspace(-0.5, 0.5, count) / (record.dt * len(r))
+    waves = np.exp(-2j * np.pi * near * np.asarray(record.t)[:, None])
+    parts = (windows * r) @ waves
+    line = (sums @ parts) / (sums @ sums)
+    left = np.sum(np.abs(parts - np.outer(sums, line)) ** 2, axis=0)
+    ratio = (count - 1) * np.abs(line) ** 2 * (sums @ sums) / np.maximum(left, THRESHOLD.tiny)
+    p = len(near) * float(np.min(stats.f.sf(ratio, 2, 2 * count - 2)))
+    return p < THRESHOLD.beyond_chance
 
 
 def narrows_no_gap(case: Case, f: Weighed) -> str:

@@ -52,7 +52,10 @@ REPAIRS = (
     ("u is in shares of one where the model has per cent", 1e2, 1.0),
 )
 
-EARLY = "y is logged one sample early, or u one sample late"
+EARLY = (
+    "y is logged one sample early, u is logged one sample late, or the sensor answers to the speed "
+    "too"
+)
 
 
 @dataclass(frozen=True, eq=False)

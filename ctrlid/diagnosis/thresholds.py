@@ -490,6 +490,11 @@ class Thresholds:
         unit="of each record",
     )  # fmt: skip
 
+    tapers: int = declare_number(
+        5, convention="so many windows tell a line of the reference from power about it; they see "
+        "as far as three times what a record resolves", unit="windows",
+        source="Thomson, Proc. IEEE 70 (1982) 1055",
+    )  # fmt: skip
     same_size: float = declare_number(
         0.05, convention="quarters whose sizes differ by less have one size for who uses the model",
         unit="of the size",

@@ -310,7 +310,7 @@ def write_conclusion(
     if disturbance.large and not told:
         kind = "a random force"
         if disturbance.coloured:
-            kind = _describe_slow_force(disturbance, gap.force_unit)
+            kind = _describe_slow_force(disturbance, "" if disturbance.forces else gap.force_unit)
         text += (f" {kind[:1].upper()}{kind[1:]} causes {_write_share(disturbance)}. It is treated "
                  "as noise here, and may hide a missing effect.")  # fmt: skip
     return text

@@ -449,7 +449,8 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     every = (finding.effect, *finding.alternatives)
     many = len({name_with_subject(e) for e in every if name_at_place(e) not in finding.equivalents})
     if many > 1:
-        text += f"; ONE OF {many} EFFECTS that explain the record"
+        what = "the record" if found.verdict == "explained" else "as much of the record"
+        text += f"; ONE OF {many} EFFECTS that explain {what}"
     elif found.finished:
         kinds = {name_at_place(c.effect) for c in found.ranking}
         count = len(kinds - {*finding.names, *finding.equivalents})

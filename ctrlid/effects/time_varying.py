@@ -1,5 +1,6 @@
 """Parameters of the plant that are off, drift, or step during a record."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, final
 
@@ -122,6 +123,10 @@ class ParameterDrift(LawEffect):
         del record
         return cls._applicable(loop, *(cls(name, 0.0) for name in _list_plant_parameters(loop)))
 
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Keep the sign of the parameter: a mass or a stiffness does not drift through zero."""
+        return {"rate": (-1 / seen.duration, math.inf)}
+
     def law(self, m: Moment) -> dict[str, Any]:
         """Return the drifting parameter."""
         return {self.name: m.plant_parameter(self.name) * (1 + self.rate * m.t)}
@@ -171,8 +176,11 @@ class ParameterStep(LawEffect):
         )
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
-        """Keep the instant within the record: outside, a step is a constant of the plant."""
-        return {"time": (0.0, seen.duration)}
+        """Keep the instant within the record, and the sign of the parameter.
+
+        Outside, a step is a constant of the plant. A damping does not jump to below zero.
+        """
+        return {"time": (0.0, seen.duration), "size": (-1.0, math.inf)}
 
     def scan(self, sight: Sight) -> Scan | None:
         """Look at instants over the record, ever closer around the best, down to one sample."""
