@@ -237,7 +237,10 @@ def raising(error, after=0, of=None):
     return call
 
 
-@pytest.mark.parametrize("error", [ModelCannotRun("lost"), EffectDoesNotApply("crossed")])
+@pytest.mark.parametrize(
+    "error",
+    [ModelCannotRun("lost"), pytest.param(EffectDoesNotApply("crossed"), marks=pytest.mark.slow)],
+)
 def test_a_candidate_that_fails_fails_alone(monkeypatch, error):
     """The refit of the first candidate fails; the second is found all the same."""
     whole = refitting.place_instants

@@ -80,7 +80,7 @@ def test_arguments_of_a_pass_stand_in_the_order_of_the_pass():
     assert PassArguments._fields == tuple(inspect.signature(filter_pass).parameters)
 
 
-@pytest.mark.parametrize("drift", [0.0, 0.4])
+@pytest.mark.parametrize("drift", [pytest.param(0.0, marks=pytest.mark.slow), 0.4])
 def test_a_filter_of_any_size_gives_the_bits_of_one_compiled_for_it(drift, monkeypatch):
     monkeypatch.setattr(kalman_recursion, "_filtered", Counter())
     monkeypatch.setattr(kalman_recursion, "OFTEN", 1000)
@@ -131,7 +131,9 @@ def textbook(s, valid, restart, input_variance, start, spread, sensor, force, me
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize(
+    "seed", [*range(8), *(pytest.param(k, marks=pytest.mark.slow) for k in range(8, 24))]
+)
 def test_a_pass_is_the_textbook_filter(seed):
     rng = np.random.default_rng([1, seed])
     size, n, m = 150, int(rng.integers(1, 6)), int(rng.integers(1, 3))

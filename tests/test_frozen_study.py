@@ -68,6 +68,7 @@ def test_a_worth_is_the_mean_of_many_log_likelihood_ratios():
     assert abs(np.mean(ratios) - np.mean(worths)) < 3.5 * error
 
 
+@pytest.mark.slow
 def test_what_is_absent_is_worth_nothing_and_no_fit_ends_half_way():
     truth = make_drive(np.random.default_rng(2))
     assert cases.measure_worth(truth, plants.make_neutral())[0] < 1e-6
@@ -208,7 +209,7 @@ def test_dry_friction_holds_what_rests():
     assert np.ptp(y[-50:]) == 0
 
 
-@pytest.mark.parametrize("size", [1e-9, 0.5])
+@pytest.mark.parametrize("size", [pytest.param(1e-9, marks=pytest.mark.slow), 0.5])
 def test_a_change_of_the_direction_takes_nothing_but_the_friction(size):
     """A mass thrown against a constant force, with dry friction, has a path in closed form."""
     e, force, h = plants.make_neutral(), -400.0, 0.02

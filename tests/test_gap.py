@@ -296,6 +296,7 @@ def test_the_time_of_a_force_runs_on_through_a_gap_of_the_log():
     assert cid.compare(gapped, loop)["closed-loop simulation"].fit > 99
 
 
+@pytest.mark.slow
 def test_a_right_name_whose_simulation_diverges_stays():
     """A cubic force pushes a pendulum over: noise alone takes its simulation out of the record."""
     few = [cid.effects.CubicStiffness, cid.effects.CoulombFriction]

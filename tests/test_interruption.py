@@ -145,6 +145,7 @@ def test_what_was_found_before_the_end_is_kept(monkeypatch):
     assert (whole.verdict, whole.finished, len(whole.findings)) == ("explained", True, 2)
 
 
+@pytest.mark.slow
 def test_friction_that_crept_in_place_of_what_was_found_later_sticks_at_the_end(answer):
     """Beside the missing offset of the input, the friction of the first round has to creep."""
     found, _ = answer
@@ -186,6 +187,7 @@ def test_a_search_ends_at_the_same_sample_whatever_the_jobs(record):
     assert (one.sentence, one.findings) == (two.sentence, two.findings)
 
 
+@pytest.mark.slow
 def test_what_is_shown_without_a_terminal(answer, record, capsys):
     lines = answer[1].splitlines()
     assert all(re.match(r"ctrlid diagnose: \d+ s, ", line) for line in lines)
@@ -367,6 +369,7 @@ def test_compiled_loops_without_a_folder_to_keep_them(monkeypatch):
     assert compile_loop(nogil=True)(lambda x: x + 1)(2) == 3
 
 
+@pytest.mark.slow
 def test_no_round_has_a_number_that_goes_back(record, monkeypatch, capsys):
     """The search is made to prefer the other effect in hindsight, and then to search again."""
     first = []

@@ -144,7 +144,9 @@ def test_two_late_inputs_are_refused_in_words():
     assert more.linearize().ninputs == 2
 
 
-@pytest.mark.parametrize(("place", "delay"), [(0, 0.6 * DT), (1, 1.3 * DT)])
+@pytest.mark.parametrize(
+    ("place", "delay"), [pytest.param(0, 0.6 * DT, marks=pytest.mark.slow), (1, 1.3 * DT)]
+)
 def test_a_fit_and_a_diagnosis_find_the_delay_and_its_place(place, delay):
     u = draw_inputs(900, seed=1)
     late = [0.0, 0.0]

@@ -170,7 +170,8 @@ def random_plant(generator, kind):
 
 
 @pytest.mark.parametrize("kind", ["stable", "integrating", "unstable"])
-@pytest.mark.parametrize("dt", [0.0, pytest.param(0.01, marks=pytest.mark.slow), 0.1])
+@pytest.mark.parametrize("dt", [0.0, pytest.param(0.01, marks=pytest.mark.slow),
+                                pytest.param(0.1, marks=pytest.mark.slow)])  # fmt: skip
 def test_random_plants_are_answered_exactly_or_refused_rightly(kind, dt):
     generator = np.random.default_rng([len(kind), int(1000 * dt)])
     answered = refused = 0

@@ -185,6 +185,7 @@ def test_ctrl_c(folder, capsys, monkeypatch):
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_as_a_module_into_a_closed_pipe(folder):
     done = subprocess.run([sys.executable, "-W", "error", "-m", "ctrlid", "--version"],
                           capture_output=True, text=True, check=False)  # fmt: skip

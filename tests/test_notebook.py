@@ -89,6 +89,7 @@ def parts(loop, record, results):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_parts_of_results_are_short_words_too(parts):
     """``found.gap`` filled a screen with numbers at a prompt, and a curve with dots."""
     kinds = {type(shown).__name__ for shown in parts}

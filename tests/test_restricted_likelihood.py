@@ -101,6 +101,7 @@ def test_instruments_are_as_good_under_a_random_force_as_the_best(force):
     assert 0.9 < np.median(ratio) < 1.5
 
 
+@pytest.mark.slow
 def test_standard_errors_beside_slow_noise_are_large_enough():
     """Of 60 draws the mean square of the distances is 1.2; without the restriction it is 1.4."""
     z = []

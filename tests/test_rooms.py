@@ -56,9 +56,10 @@ def test_a_user_sees_the_public_names_and_nothing_else():
 
 @pytest.mark.parametrize(
     "words",
-    ["import ctrlid.plot; ctrlid.plot.bode", "import ctrlid.plants; ctrlid.plants.maglev",
-     "import ctrlid.datasets; ctrlid.datasets.load", "from ctrlid.plants import maglev",
-     "from ctrlid.plot import bode", "from ctrlid.effects import InputDelay"],
+    ["import ctrlid.plot, ctrlid.plants, ctrlid.datasets; ctrlid.plot.bode; ctrlid.plants.maglev; "
+     "ctrlid.datasets.load",
+     "from ctrlid.plants import maglev; from ctrlid.plot import bode; "
+     "from ctrlid.effects import InputDelay"],
 )  # fmt: skip
 def test_modules_are_imported_by_their_public_names(words):
     done = subprocess.run([sys.executable, "-c", words], cwd=ROOT, capture_output=True, text=True)

@@ -80,6 +80,7 @@ def test_random_noise_and_analog_controllers(seed, digital):
         assert "FAILED" in str(sweep)
 
 
+@pytest.mark.slow
 def test_noise_free_records_need_no_slowing_down():
     record = levitated(0.05, 2000, noise=0.0)
     sweep = cid.sweep_sampling_period(record, [record.dt, 4 * record.dt])

@@ -185,6 +185,7 @@ def test_a_drift_that_settles_is_no_constant_force():
     assert E.equivalents(E.SensorDrift(0.1, settling=3.0), servo) == ()
 
 
+@pytest.mark.slow
 def test_hum_on_a_levitated_ball_is_named_beside_the_force_that_fits_as_well():
     """What a scan found pays for the scan on both sides of a comparison."""
     loop = levitation()

@@ -206,7 +206,8 @@ def test_the_runs_of_a_chance_spread_as_many_more_do():
 
 
 @pytest.mark.parametrize(("name", "plant"), [
-    ("ar", "drive"), pytest.param("ar", "pendulum", marks=pytest.mark.slow), ("averaged", "ball"),
+    ("ar", "drive"), pytest.param("ar", "pendulum", marks=pytest.mark.slow),
+    pytest.param("averaged", "ball", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_the_order_is_asked_again_where_the_colour_has_moved_the_parameters(name, plant):
     """Beside parameters that a random force had led astray an average looked like a wander."""

@@ -67,6 +67,7 @@ def test_standard_errors_are_those_of_white_noise():
         assert abs(value - TANKS[name]) < 4.5 * error < 0.2 * TANKS[name]
 
 
+@pytest.mark.slow
 def test_the_search_names_an_overflow_and_a_wrong_zero():
     real = tanks().with_effect(E.StateLimit(name="h1", upper=8.0, spill_to="h2", share=1.0))
     real = real.with_effect(E.SensorOffset(0.6))

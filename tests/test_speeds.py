@@ -47,7 +47,9 @@ def run_motor(friction, seed, n=2000):
     return cid.Record(dt=DT, r=r, u=u, y=y)
 
 
-@pytest.mark.parametrize("forces", [{"omega": "i"}, {"omega": None}])
+@pytest.mark.parametrize(
+    "forces", [{"omega": "i"}, pytest.param({"omega": None}, marks=pytest.mark.slow)]
+)
 def test_friction_of_a_drive_with_a_tachometer(forces):
     loop = make_loop(free=("c",), forces=forces, units={"omega": "rad/s"})
     friction = E.CoulombFriction, E.ViscousFriction, E.ConstantForce, E.InputDeadZone
@@ -112,7 +114,7 @@ def reaction_wheel():
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("friction", [0.0, 4e-3])
+@pytest.mark.parametrize("friction", [pytest.param(0.0, marks=pytest.mark.slow), 4e-3])
 def test_friction_at_a_reaction_wheel(friction):
     plant, dt, n = reaction_wheel(), 0.005, 3000
     at = cid.OperatingPoint((0.0, 0.0, 0.0), 0.0, (0.0, 0.0))

@@ -41,7 +41,8 @@ def make_loop():
     return cid.Loop(plant, None, dt=DT, at=at, free=("s", "c"))
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_limits_on_both_sides_are_found(seed):
     record = push_spring(seed, 0.45, 1.0)
     found = cid.diagnose(record, make_loop(), catalogue=SOME, progress=False)

@@ -115,7 +115,10 @@ def test_the_mass_of_a_pendulum_moves_on_a_circle():
 
 @pytest.mark.parametrize(
     ("units", "said"),
-    [({}, " [theta]/s^2"), ({"theta": "rad", "J": "kg m^2"}, " N m at J = 0.5 kg m^2)")],
+    [
+        pytest.param({}, " [theta]/s^2", marks=pytest.mark.slow),
+        ({"theta": "rad", "J": "kg m^2"}, " N m at J = 0.5 kg m^2)"),
+    ],
 )
 def test_an_output_in_degrees_of_an_angle_in_radians_gives_no_unit_to_forces(units, said):
     """Friction of 3 rad/s^2 was told as 3 °/s^2."""

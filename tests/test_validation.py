@@ -101,7 +101,7 @@ def test_a_run_is_followed_from_the_middle_of_a_fall():
         )  # its noise, through the loop
 
 
-@pytest.mark.parametrize("fc", [0.05, 0.3])
+@pytest.mark.parametrize("fc", [pytest.param(0.05, marks=pytest.mark.slow), 0.3])
 def test_dry_friction_damps_no_prediction_of_what_moves(fc):
     # At rest its steep slope makes the fall a hundred times slower; on the move it does not.
     loop = cid.Loop(PLANT, DIGITAL, dt=DT, at=AT)

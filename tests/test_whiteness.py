@@ -76,7 +76,7 @@ def test_coloured_noise_is_said_in_capitals(kind):
     assert "diagnose() fits coloured noise as well" in said
 
 
-@pytest.mark.parametrize("kind", ["averaged", "slow"])
+@pytest.mark.parametrize("kind", ["averaged", pytest.param("slow", marks=pytest.mark.slow)])
 def test_a_continuous_fit_has_coloured_noise_of_its_own(kind):
     """The noise is a moving average of some order: a1 = 0, a2 = -16 and b1 = 30 are covered."""
     estimate = fit("fit_continuous", simulate_unstable(kind, 1))
