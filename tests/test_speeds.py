@@ -1,11 +1,14 @@
 """Speeds whose position is no state: a drive with a tachometer, a reaction wheel."""
 
+import math
+
 import control as ct
 import numpy as np
 import pytest
 
 import ctrlid as cid
 import ctrlid.effects as E
+from ctrlid.diagnosis.recalibration import fit_base_model
 
 DT, FINE = 0.01, 40
 J, C, KT = 2e-3, 1e-3, 0.05  # kg m^2, N m s/rad, N m/A
@@ -25,20 +28,21 @@ def make_loop(**options):
     return cid.Loop(motor(), law, dt=DT, **options)
 
 
-def run_motor(friction, seed, n=2000):
-    """The log of a motor under its PI, with dry friction [N m]."""
+def run_motor(friction, seed, n=2000, loads=(0.0,), noise=0.1):
+    """The log of a motor under its PI, with dry friction and loads in turn [N m]."""
     rng = np.random.default_rng(seed)
     r = np.repeat(rng.uniform(-30, 30, n // 50), 50)
     w = sum_of_errors = past = 0.0
     y, u = np.empty(n), np.empty(n)
     h = DT / FINE
     for k in range(n):
-        y[k] = w + 0.1 * rng.standard_normal()
+        y[k] = w + noise * rng.standard_normal()
+        load = loads[k * len(loads) // n]
         error = r[k] - y[k]
         sum_of_errors += 0.083 * error - 0.08 * past
         past, u[k] = error, sum_of_errors
         for _ in range(FINE):
-            torque = KT * u[k] - C * w
+            torque = KT * u[k] - C * w - load
             if w == 0 and abs(torque) <= friction:
                 break
             turning = np.sign(w) if w != 0 else np.sign(torque)
@@ -61,6 +65,14 @@ def test_friction_of_a_drive_with_a_tachometer(forces):
     assert found.gap.after < 1.1 * found.gap.floor
     clean = cid.diagnose(loop, run_motor(0.0, 2), catalogue=friction)
     assert clean.verdict == "nothing missing"
+
+
+def test_steps_of_a_load_leave_the_sensor_its_noise():
+    """A white force that stood for them left the sensor a thousandth, and a name was found."""
+    record = run_motor(0.0, seed=3, n=1200, loads=(0.0, 0.1, -0.05, 0.1, 0.0), noise=0.05)
+    fit = fit_base_model(make_loop(), [record], ("kt", "c")).fit
+    assert math.sqrt(fit.sensor_noises[0]) == pytest.approx(0.05, rel=0.1)
+    assert fit.noise.drift > 0
 
 
 def test_who_does_not_say_that_it_is_a_speed_is_told():

@@ -24,24 +24,44 @@ from .fit import ENOUGH, fit_noise
 SIZES, AVERAGED = (-0.4, 0.4, 0.8, 0.97), 0.9
 # Steps of a random walk from which a fit of one beside white noise starts, over the white noise.
 WALKS = (0.01, 0.03, 0.1, 0.3)
+# A sensor whose noise makes a smaller share of the variance of one-step errors reads exactly.
+EXACT = 1e-4
+# Where one seems to, a fit of a coloured force also starts from so much of the white one.
+SMALLER = 1e-4
 # Orders of coloured sensor noise: of the autoregression and of the moving average, at most.
 ORDERS = 2, 3
 
 
 def try_coloured_force(fit: Fit) -> Fit:
-    """Return the fit with a coloured force added, whether or not the BIC prefers it."""
+    """Return the fit with a coloured force added, whether or not the BIC prefers it.
+
+    A white force alone that stood for the coloured one may have left hardly any noise to the
+    sensor. Then all forces are also tried far smaller beside it.
+    """
     dt = fit.plant.loop.dt
-    force, whole = tuple(0.5 * v for v in fit.noise.force), sum(fit.noise.force)
     memories = [math.exp(-dt / time) for time in (3 * dt, 30 * dt, 300 * dt)]
-    noises = [
-        Noise(force, memory, share * whole * (1 - memory**2), tails=fit.noise.tails)
-        for memory in memories
-        for share in (1e-2, 1.0)
-    ]
-    best, value = _find_likeliest(fit, noises)
-    if not np.isfinite(value):
+    tried = []
+    for smaller in (1.0, SMALLER) if _reads_exactly(fit) else (1.0,):
+        noises = [
+            Noise(tuple(0.5 * smaller * v for v in fit.noise.force), memory,
+                  share * smaller * sum(fit.noise.force) * (1 - memory**2), tails=fit.noise.tails)
+            for memory in memories
+            for share in (1e-2, 1.0)
+        ]  # fmt: skip
+        best, value = _find_likeliest(fit, noises)
+        if np.isfinite(value):
+            tried.append(fit_noise(fit.problem, fit.theta, fit.linearized, best))
+    if not tried:
         raise ModelCannotRun(f"no coloured force can be fitted to {fit.plant.e.name}")
-    return fit_noise(fit.problem, fit.theta, fit.linearized, best)
+    return max(tried, key=lambda fit: fit.value)
+
+
+def _reads_exactly(fit: Fit) -> bool:
+    """Whether a sensor has hardly any noise beside what a random force does within a period."""
+    return any(
+        EXACT * float(np.mean(out.variance[keep])) > 1.0
+        for out, keep in zip(fit.filtered, fit.counts, strict=False)
+    )
 
 
 def _find_likeliest(fit: Fit, noises: Sequence[Noise]) -> tuple[Noise, float]:
