@@ -32,8 +32,8 @@ def make_loop(free=(), **given):
     return cid.Loop(make_plant(**given), law, dt=DT, at=at, free=free)
 
 
-def swing(seed, n=1500, friction=0.0, **true):
-    """Return a record of the real pendulum, by scipy."""
+def swing(seed, n=1500, friction=0.0, load=lambda t: 1.0, **true):
+    """Return a record of the real pendulum, by scipy; its mass may change by a load."""
     p = {**TRUE, **true}
     rng = np.random.default_rng(seed)
     r = 0.15 * np.repeat(rng.choice([-1.0, 1.0], n // 50), 50)
@@ -46,9 +46,11 @@ def swing(seed, n=1500, friction=0.0, **true):
         us.append(u)
         ys.append(y)
 
-        def rates(t, x, u=u):
+        mass = p["m"] * load(k * DT)
+
+        def rates(t, x, u=u, mass=mass):
             torque = u - p["c"] * x[1] - friction * np.tanh(x[1] / 1e-3)
-            return [x[1], 9.81 / p["l"] * np.sin(x[0]) + torque / (p["m"] * p["l"] ** 2)]
+            return [x[1], 9.81 / p["l"] * np.sin(x[0]) + torque / (mass * p["l"] ** 2)]
 
         x = solve_ivp(rates, (0, DT), x, rtol=1e-8, atol=1e-10).y[:, -1]
     return cid.Record(r=r, u=us, y=ys, dt=DT)
@@ -137,3 +139,35 @@ def test_a_parameter_is_wrong_by_a_factor_of_ten_at_most():
     assert bounds["error"] == (-0.9, 9.0)
     with pytest.raises(cid.CtrlidError, match="error"):
         E.ParameterError("m", 200.0)
+
+
+CHANGES = (E.ParameterDrift, E.ParameterStep)
+
+
+@pytest.mark.parametrize(("load", "name", "size"), [
+    (lambda t: 1 + 0.02 * t, "ParameterDrift", {"rate": 0.02}),
+    (lambda t: 1.25 if t > 4 else 1.0, "ParameterStep", {"time": 4.0, "size": 0.25}),
+])  # fmt: skip
+def test_what_was_exact_at_first_may_change(load, name, size):
+    """Three effects of free parameters were named together for a battery that ran down."""
+    found = cid.diagnose(make_loop(("c",)), swing(5, n=900, load=load), progress=False,
+                         catalogue=(*CHANGES, E.ViscousFriction, E.LinearStiffness))  # fmt: skip
+    (finding,) = found.findings
+    assert (finding.name, finding.effect.name) == (name, "m")
+    for key, value in size.items():
+        assert getattr(finding.effect, key) == pytest.approx(value, rel=0.05)
+
+
+def test_the_same_change_of_another_parameter_is_asked():
+    """A motor's gain and its inertia change its motion alike, but for its small damping."""
+    plant = cid.plants.servo(m=0.5, c=0.02, k=3.0)
+    loop = cid.Loop(plant, ct.tf([60.0, -57.0], [1.0, -0.3], DT), dt=DT, free=("k",))
+    r = cid.random_binary(800, amplitude=0.1, hold=40, seed=3)
+    real = loop.with_effect(E.ParameterStep("k", time=3.1, size=-0.2))
+    record = cid.simulate(real, r, sensor_noise=5e-3, seed=4)
+    found = cid.diagnose(loop, record, progress=False, catalogue=CHANGES)
+    (finding,) = found.findings
+    changed = {(type(e).__name__, e.name) for e in (finding.effect, *finding.alternatives)}
+    assert {("ParameterStep", "k"), ("ParameterStep", "m")} <= changed
+    assert "ParameterStep of" in found.sentence
+    assert found.sentence.count("ParameterStep of") == 2

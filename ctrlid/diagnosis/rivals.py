@@ -241,12 +241,11 @@ def _compare_in_round(
     if not mine.net_gain > THRESHOLD.gate:
         mine = f.trial
     all_close = [mine, *again]
-    near = {t.key for t in all_close}
     best = max(all_close, key=lambda t: t.net_gain)
     if best.net_gain > mine.net_gain + THRESHOLD.taken_by_better:
         model, mine, f = best.model, best, replace(f, trial=best)
     others = [t for t in all_close if t is not mine]
-    rest = [t for t in step.trials if t.key not in near]
+    rest = [t for t in step.trials if not any(is_same_kind(t.effect, c.effect) for c in all_close)]
     # What a noise that was chosen since gains is no evidence of an effect.
     since = mine.gain - f.trial.gain
     alike = [replace(t, gain=t.gain - since) for t in find_rivals(mine, others, sure)]
@@ -279,7 +278,8 @@ def _find_close(mine: Trial, steps: Sequence[Round], beside: bool = False) -> li
 
     Or that one which resembles it won, whose place it took since. Where more was found `beside` it,
     what resembles it may have come nowhere in that round, and is asked again: a lag of the actuator
-    gains nothing while the curve of the input that it acts behind is missing.
+    gains nothing while the curve of the input that it acts behind is missing. The same change of
+    another parameter is always asked, since a score hardly tells which of them changed.
     """
     won = [s for s in steps if s.best is not None and s.best.key == mine.key]
     lost = [s for s in steps if s.best is not None and s.best.resembles(mine)]
@@ -289,10 +289,11 @@ def _find_close(mine: Trial, steps: Sequence[Round], beside: bool = False) -> li
         near = [
             t
             for t in step.trials
-            if t.key != mine.key
+            if not is_same_kind(t.effect, mine.effect)
             and (
                 (t.net_gain > THRESHOLD.gate and (t.resembles(mine) or t.net_gain > least))
                 or (beside and t.resembles(mine) and t.score > -math.inf)
+                or (type(t.effect) is type(mine.effect) and t.score > -math.inf)
             )
         ]
         return near[: THRESHOLD.looked_at]

@@ -13,7 +13,7 @@ from ..effects import AbstractEffect
 from ..effects.context import find_output_of
 from ..estimation.likelihood.force_score import compute_force_scores
 from .candidates import Objection, Trial, attempt_trial
-from .fitted_model import Model
+from .fitted_model import Model, carry_over_fit
 from .places import find_force_channel, find_position
 from .screening import screen_candidate, screen_starts
 from .shape_scores import score_shapes
@@ -95,6 +95,13 @@ class ModelSight:
         """Return the fitted value of a free parameter of the plant, or None if it is not free."""
         names = self.model.names
         return float(self.model.fit.theta[names.index(name)]) if name in names else None
+
+    def with_free(self, name: str) -> "ModelSight":
+        """Return what the model sees with a further parameter of the plant free, as it is now."""
+        if name in self.model.names:
+            return self
+        fitted, names = self.model.fitted, (*self.model.names, name)
+        return replace(self, model=Model(fitted, carry_over_fit(self.model, fitted, names)))
 
     def force_scores(self, draws: int) -> list[Array]:
         """Return the derivative of the log-likelihood by a force held over each single period."""

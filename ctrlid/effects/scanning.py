@@ -84,6 +84,9 @@ class Sight(Overview, Protocol):
     def parameter(self, name: str) -> float | None:
         """Return the fitted value of a free parameter of the plant, or None if it is not free."""
 
+    def with_free(self, name: str) -> Sight:
+        """Return what the model sees with a further parameter of the plant free, as it is now."""
+
     def force_scores(self, draws: int) -> Sequence[Array]:
         """Return the derivative of the log-likelihood by a force held over each single period.
 

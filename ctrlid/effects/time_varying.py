@@ -69,22 +69,26 @@ class ParameterError(LawEffect):
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return one for each parameter of the plant that is called exact."""
         del record
-        known = loop.equations().parameters
-        fixed = [
-            k for k, v in known.items()
-            if "." not in k and k not in loop.free and v != 0
-            and not (k == "g" and GRAVITY[0] <= v <= GRAVITY[1])
-        ]  # fmt: skip
-        return cls._applicable(loop, *(cls(name, 0.0) for name in fixed))
+        return cls._applicable(loop, *(cls(name, 0.0) for name in _list_exact_parameters(loop)))
 
     def law(self, m: Moment) -> dict[str, Any]:
         """Return the parameter as it is."""
         return {self.name: m.plant_parameter(self.name) * (1 + self.error)}
 
 
-def _list_plant_parameters(loop: Any) -> list[str]:
-    """Return the free parameters that are the plant's own."""
-    return [name for name in loop.free if name.partition(".")[0] not in loop.labelled]
+def _list_exact_parameters(loop: Any) -> list[str]:
+    """Return the parameters of the plant that are called exact, without the earth's gravity."""
+    return [
+        k for k, v in loop.equations().parameters.items()
+        if "." not in k and k not in loop.free and v != 0
+        and not (k == "g" and GRAVITY[0] <= v <= GRAVITY[1])
+    ]  # fmt: skip
+
+
+def _list_changing(loop: Any) -> list[str]:
+    """Return the parameters of the plant that may change: what was exact once need not stay so."""
+    own = [name for name in loop.free if name.partition(".")[0] not in loop.labelled]
+    return [*own, *_list_exact_parameters(loop)]
 
 
 @final
@@ -94,7 +98,8 @@ class ParameterDrift(LawEffect):
 
     .. math:: \theta(t) = \theta (1 + \rho t)
 
-    A coil that warms up, a battery that runs down, a heat exchanger that fouls.
+    A coil that warms up, a battery that runs down, a heat exchanger that fouls. It is tried for
+    each parameter of the plant, free or exact, but for the gravity of the earth.
 
     Parameters
     ----------
@@ -119,9 +124,9 @@ class ParameterDrift(LawEffect):
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
-        """Return one for each free parameter of the plant."""
+        """Return one for each parameter of the plant."""
         del record
-        return cls._applicable(loop, *(cls(name, 0.0) for name in _list_plant_parameters(loop)))
+        return cls._applicable(loop, *(cls(name, 0.0) for name in _list_changing(loop)))
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Keep the sign of the parameter: a mass or a stiffness does not drift through zero."""
@@ -139,7 +144,8 @@ class ParameterStep(LawEffect):
 
     .. math:: \theta(t) = \theta (1 + \sigma H(t - t_s))
 
-    with the step H spread over one sampling period, so that its time can be fitted.
+    with the step H spread over one sampling period, so that its time can be fitted. It is tried for
+    each parameter of the plant, free or exact, but for the gravity of the earth.
 
     Parameters
     ----------
@@ -169,11 +175,9 @@ class ParameterStep(LawEffect):
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
-        """Return one of no size for each free parameter; its time is to be scanned."""
+        """Return one of no size for each parameter of the plant; its time is to be scanned."""
         half = 500 * loop.dt if record is None else record.duration / 2
-        return cls._applicable(
-            loop, *(cls(name, half, 0.0) for name in _list_plant_parameters(loop))
-        )
+        return cls._applicable(loop, *(cls(name, half, 0.0) for name in _list_changing(loop)))
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Keep the instant within the record, and the sign of the parameter.
@@ -184,6 +188,7 @@ class ParameterStep(LawEffect):
 
     def scan(self, sight: Sight) -> Scan | None:
         """Look at instants over the record, ever closer around the best, down to one sample."""
+        sight = sight.with_free(self.name)
         value = sight.parameter(self.name)
         if value is None:
             return None
