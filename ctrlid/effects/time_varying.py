@@ -86,9 +86,12 @@ def _list_exact_parameters(loop: Any) -> list[str]:
 
 
 def _list_changing(loop: Any) -> list[str]:
-    """Return the parameters of the plant that may change: what was exact once need not stay so."""
+    """Return the parameters of the plant that may change: what was exact once need not stay so.
+
+    Of a plant with several signals the free ones alone, since there each place adds to a search.
+    """
     own = [name for name in loop.free if name.partition(".")[0] not in loop.labelled]
-    return [*own, *_list_exact_parameters(loop)]
+    return [*own, *_list_exact_parameters(loop)] if loop.equations().siso else own
 
 
 @final
@@ -99,7 +102,8 @@ class ParameterDrift(LawEffect):
     .. math:: \theta(t) = \theta (1 + \rho t)
 
     A coil that warms up, a battery that runs down, a heat exchanger that fouls. It is tried for
-    each parameter of the plant, free or exact, but for the gravity of the earth.
+    each parameter of the plant, free or exact, but for the gravity of the earth; of a plant with
+    several signals for the free ones.
 
     Parameters
     ----------
@@ -145,7 +149,7 @@ class ParameterStep(LawEffect):
     .. math:: \theta(t) = \theta (1 + \sigma H(t - t_s))
 
     with the step H spread over one sampling period, so that its time can be fitted. It is tried for
-    each parameter of the plant, free or exact, but for the gravity of the earth.
+    the parameters for which a `ParameterDrift` is.
 
     Parameters
     ----------
