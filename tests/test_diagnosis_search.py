@@ -40,7 +40,7 @@ from ctrlid.diagnosis.noise_tests import NoiseTests, _compute_force_deviates, ru
 from ctrlid.diagnosis.ordering import order_last_effect
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.refitting import place_instants, refit_candidate, refit_under_noise
-from ctrlid.diagnosis.removal import fuse_effects, refit_without_effect
+from ctrlid.diagnosis.removal import fuse_effects, refit_without_effect, weigh_effects
 from ctrlid.diagnosis.replicas import make_replica
 from ctrlid.diagnosis.rivals import _find_close, find_rivals
 from ctrlid.diagnosis.scans import scan_candidate
@@ -806,6 +806,27 @@ def test_a_standard_error_does_not_overrule_a_likelihood(two_found, monkeypatch)
     # What explains as much without the effect takes its place all the same.
     monkeypatch.setattr(removal, "refit_noise", lambda smaller: model)
     assert removal.weigh_without_effect(model, 0)[1] is flat
+
+
+@pytest.mark.parametrize("ended", [-np.inf, -60.0])
+def test_evidence_is_against_the_likeliest_model_that_the_search_passed(
+    two_found, monkeypatch, ended
+):
+    """A climb without an effect that ends too low, or loses the record, makes no evidence."""
+    model, steps = two_found.final, two_found.steps
+    weigh = removal.weigh_without_effect
+
+    def fall_short(model, position):
+        smaller, trial = weigh(model, position)
+        low = replace(smaller.fit, value=smaller.fit.value + ended)
+        return replace(smaller, fit=low), replace(trial, gain=trial.gain - ended)
+
+    honest = {f.position: f for f in weigh_effects(model, 0, steps)[1]}
+    monkeypatch.setattr(removal, "weigh_without_effect", fall_short)
+    found = {f.position: f for f in weigh_effects(model, 0, steps)[1]}
+    last = max(found)
+    assert found[last].trial.net_gain == pytest.approx(honest[last].trial.net_gain, abs=1.0)
+    assert np.isfinite(found[last].base.fit.value)
 
 
 def test_a_search_ends_with_the_likeliest_state_it_passed_through(monkeypatch):

@@ -66,8 +66,8 @@ def weigh_effects(
     for position in range(given, len(model.loop.effects)):
         refitted, mine = weigh_without_effect(model, position)
         smaller = _find_likeliest_passed(refitted, steps)
-        lost = compute_criterion(smaller) - compute_criterion(refitted)
-        mine = replace(mine, gain=mine.gain - lost) if lost > 0 else mine
+        if smaller is not refitted:
+            mine = _count_beyond(smaller, model, mine)
         if mine.net_gain <= THRESHOLD.gate:
             return weigh_effects(refit_noise(smaller), given, steps)
         found.append(Weighed(mine, (), smaller, position))
@@ -226,14 +226,17 @@ def weigh_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
     if not (flat and trial.gain - trial.penalty > THRESHOLD.gate):
         return smaller, trial
     smaller = refit_noise(smaller)
-    lost = compute_criterion(model) - compute_criterion(smaller)
-    if lost <= THRESHOLD.gate:
-        return smaller, trial
-    gain = model.fit.value - smaller.fit.value
     # A trial that was put out has lost what a comparison of likelihoods needs; the model has it.
     label = list(model.loop.labelled)[position]
-    whole = replace(trial, label=label, model=model, out=None)
-    return smaller, replace(whole, gain=gain, penalty=gain - lost)
+    whole = _count_beyond(smaller, model, replace(trial, label=label, model=model, out=None))
+    return smaller, whole if whole.net_gain > THRESHOLD.gate else trial
+
+
+def _count_beyond(smaller: Model, model: Model, trial: Trial) -> Trial:
+    """Return a trial with what a model gains beyond a smaller one, all that was fitted paid for."""
+    gain = model.fit.value - smaller.fit.value
+    net = compute_criterion(model) - compute_criterion(smaller)
+    return replace(trial, gain=gain, penalty=gain - net)
 
 
 def refit_noise(model: Model) -> Model:
