@@ -114,7 +114,7 @@ def assemble_answer(
     objection = find_doubt(effects, gains, total)
     objection = objection or describe_grounds(grounds)
     if not (findings or stand_ins):
-        objection = blame_slow_force(disturbance, "" if disturbance.forces else gap.force_unit)
+        objection = blame_slow_force(disturbance, gap.force_unit)
     complete = found.after.passed and not left and objection is None
     verdict = choose_verdict(complete, named=bool(findings))
     notes = (*fitted.estimate.notes, *_list_notes(loop, found))

@@ -292,8 +292,10 @@ def _find_close(mine: Trial, steps: Sequence[Round], beside: bool = False) -> li
             if not is_same_kind(t.effect, mine.effect)
             and (
                 (t.net_gain > THRESHOLD.gate and (t.resembles(mine) or t.net_gain > least))
-                or (beside and t.resembles(mine) and t.score > -math.inf)
-                or (type(t.effect) is type(mine.effect) and t.score > -math.inf)
+                or (
+                    t.score > -math.inf
+                    and (type(t.effect) is type(mine.effect) or (beside and t.resembles(mine)))
+                )
             )
         ]
         return near[: THRESHOLD.looked_at]

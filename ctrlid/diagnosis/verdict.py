@@ -134,7 +134,8 @@ def blame_slow_force(disturbance: Disturbance, unit: str) -> str | None:
 
 
 def _describe_slow_force(disturbance: Disturbance, unit: str) -> str:
-    size = write_quantity(disturbance.coloured, unit, digits=2)
+    # Where forces act on several states, this one has no unit of its own.
+    size = write_quantity(disturbance.coloured, "" if disturbance.forces else unit, digits=2)
     time = write_quantity(disturbance.time_constant, "s", digits=2)
     return f"a slowly varying random force of {size} RMS with a time constant of {time}"
 
@@ -310,7 +311,7 @@ def write_conclusion(
     if disturbance.large and not told:
         kind = "a random force"
         if disturbance.coloured:
-            kind = _describe_slow_force(disturbance, "" if disturbance.forces else gap.force_unit)
+            kind = _describe_slow_force(disturbance, gap.force_unit)
         text += (f" {kind[:1].upper()}{kind[1:]} causes {_write_share(disturbance)}. It is treated "
                  "as noise here, and may hide a missing effect.")  # fmt: skip
     return text

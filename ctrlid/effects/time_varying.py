@@ -194,8 +194,6 @@ class ParameterStep(LawEffect):
         """Look at instants over the record, ever closer around the best, down to one sample."""
         sight = sight.with_free(self.name)
         value = sight.parameter(self.name)
-        if value is None:
-            return None
         last = float(max(t[-1] for t in sight.times))
         # At the very ends a step is only another name for the initial state.
         low, high = EDGE * last, (1 - EDGE) * last

@@ -328,15 +328,15 @@ def maximize_under_quiet_force(fit: Fit) -> Fit:
     """
     noise = fit.noise
     for share in QUIETER:
-        quieter = replace(noise, force=tuple(share * v for v in noise.force))
+        quieter = quieten_force(noise, share)
         held = replace(fit, noise=quieter, problem=replace(fit.problem, known=Known(quieter)))
         fit = maximize(held, exact=False)
     return fit
 
 
-def quieten_force(noise: Noise) -> Noise:
-    """Return noise with hardly any random force."""
-    return replace(noise, force=tuple(QUIET * v for v in noise.force))
+def quieten_force(noise: Noise, share: float = QUIET) -> Noise:
+    """Return noise with a share of its random force, which is hardly any by default."""
+    return replace(noise, force=tuple(share * v for v in noise.force))
 
 
 def choose_noise(fit: Fit, always: bool = False) -> Fit:
