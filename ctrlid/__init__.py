@@ -7,11 +7,12 @@ from ._base.errors import CtrlidError, CtrlidWarning
 from .data import datasets
 from .data.record import Record
 from .data.references import multisine, prbs, random_binary, staircase
-from .design.controller_trial import ControllerTrial, ReferenceStep, StepMotion
+from .design.controller_trial import ControllerTrial
 from .design.input_margins import LoopPerformance
 from .design.lead import design_lead
 from .design.margins import Margins, loop_margins, nu_gap, robust_margin
 from .design.redesigning import Performance, Redesign, redesign
+from .design.reference_steps import ReferenceStep, StepMotion
 from .diagnosis import (
     BinnedErrors,
     Calibrated,

@@ -22,18 +22,13 @@ from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.conversions import sample_held, to_transfer_function
 from ..physics.trace import timebase
-from .controller_trial import (
-    CLOSE,
-    LOST,
-    ControllerTrial,
-    advise_step,
-    try_design,
-    write_sentence,
-)
+from .controller_trial import CLOSE, ControllerTrial
+from .design_trial import try_design
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
+from .reference_steps import LOST, write_sentence
 from .settling import SETTLED, TAIL, explain_unsettled, settles_otherwise
-from .step_height import StepHeight, choose_height, try_heights
+from .step_height import StepHeight, advise_step, choose_height, try_heights
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,16 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidWarning
-from .._base.text import write_number, write_percent, write_quantity
+from .._base.text import write_list, write_number, write_percent, write_quantity
 from .._base.units import count_per_si_unit
+from ..effects import (
+    AsymmetricCoulombFriction,
+    CoulombFriction,
+    InputBacklash,
+    InputDeadZone,
+    Quantization,
+    StribeckFriction,
+)
 from ..loop.loop import Loop, find_input_limits
 from .settling import find_reading_step
 
@@ -24,6 +32,11 @@ SEVERAL = 50
 MOST = 5.0
 # A guess with which the physics breaks off is divided by ten so many times.
 TENTHS = 5
+# These have a kink at rest, of which the smallest signals see most.
+KINKS = (
+    AsymmetricCoulombFriction, CoulombFriction, InputBacklash, InputDeadZone, Quantization,
+    StribeckFriction,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -182,3 +195,24 @@ def _choose_smooth_height(
         "a guess: give step= what is small for this plant."
     )
     return SHARE * count_per_si_unit(unit), words, False
+
+
+def advise_step(loop: Loop) -> str:
+    """Return which height of a step brings the physics of a loop closer to the promised values.
+
+    What is smooth is linear for small signals. Of a kink at rest, such as dry friction, the
+    smallest signals see most.
+    """
+    kinks = [
+        name for name, e in loop.labelled.items() if not e.neutral and isinstance(e, KINKS)
+    ]  # fmt: skip
+    if kinks:
+        return (
+            f"{write_list(kinks)} {'counts' if len(kinks) == 1 else 'count'} for more the smaller "
+            "the step is, and the promise leaves that out: with a larger step= they are closer to "
+            "the promised values, as far as the input and the range of the plant allow."
+        )
+    return (
+        "With a smaller step= they are closer to the promised values, unless the equations of the "
+        "plant have a kink at rest, such as dry friction."
+    )

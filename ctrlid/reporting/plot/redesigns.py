@@ -8,8 +8,9 @@ import numpy as np
 from ..._base.arguments import explain_names
 from ..._base.errors import CtrlidError
 from ..._base.text import choose_prefix, with_unit
-from ...design.controller_trial import ControllerTrial, ReferenceStep, StepMotion
+from ...design.controller_trial import ControllerTrial
 from ...design.redesigning import Redesign
+from ...design.reference_steps import ReferenceStep, StepMotion
 from ...loop.loop import Loop
 from .axes import MARKERS, Picture, choose_line_style, figure, finish_axes, require_kind, take_axes
 
