@@ -196,4 +196,8 @@ def _find_best_place(model: Model, effect: AbstractEffect) -> Trial:
     else:
         tried = (screen_starts(model, group, penalty) for group in scan.starts)
         best = max(tried, key=lambda t: t.score)
+        if not best.score > 0:
+            # What is fainter than the first may promise something all the same.
+            best = max(best, screen_candidate(model, scan.starts[0][0], penalty),
+                       key=lambda t: t.score)  # fmt: skip
     return replace(best, others=scan.others)

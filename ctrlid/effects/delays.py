@@ -10,9 +10,9 @@ from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Backlash, Equations
 from ..physics.linearization import OperatingPoint
 from .context import Moment
-from .kinds import InputEffect, choose_widths, require_one_input
+from .kinds import InputEffect, choose_widths, require_one_input, scan_widths
 from .parameters import parameter
-from .scanning import Range
+from .scanning import Range, Scan, Sight
 from .symbolic import to_expression
 
 
@@ -178,6 +178,15 @@ class InputBacklash(InputEffect):
         """Return gaps of a tenth of the range of the recorded input, and of all but a tenth."""
         widths = choose_widths(loop, record)
         return cls._applicable(loop, *(cls(width=width) for width in widths))
+
+    def scan(self, sight: Sight) -> Scan | None:
+        """Look at a few widths."""
+        return scan_widths(self, sight)
+
+    @classmethod
+    def is_scanned(cls) -> bool:
+        """Say no: a few widths hardly take longer than one."""
+        return False
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the backlash ahead of them."""

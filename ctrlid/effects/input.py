@@ -13,7 +13,7 @@ import numpy as np
 from .._base.arguments import is_number
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from .context import Moment
-from .kinds import InputEffect, choose_widths
+from .kinds import InputEffect, choose_widths, scan_widths
 from .parameters import parameter
 from .scanning import CUT_OFF, Scan, Sight
 
@@ -160,6 +160,15 @@ class InputDeadZone(InputEffect):
         if _passes_zero_elsewhere(loop, record):
             zones += [replace(zone, centre=0.0) for zone in zones]
         return cls._applicable(loop, *zones)
+
+    def scan(self, sight: Sight) -> Scan | None:
+        """Look at a few widths."""
+        return scan_widths(self, sight)
+
+    @classmethod
+    def is_scanned(cls) -> bool:
+        """Say no: a few widths hardly take longer than one."""
+        return False
 
     def input(self, m: Moment) -> Any:
         """Return the input without what the zone swallows."""

@@ -12,7 +12,11 @@ from ..physics.integration import put_entry
 from ..physics.symbols import Symbol
 from .base import AbstractEffect, Place, refuse_missing_formula, require_motion
 from .context import Moment
+from .scanning import Scan, Sight
 from .symbolic import substitute_symbol, to_expression, trace_hook
+
+# A gap or a zone is tried so many times as wide as the narrow one that a fit starts from.
+WIDER = (1.0, 2.0, 4.0)
 
 
 class LawEffect(AbstractEffect):
@@ -122,6 +126,19 @@ def choose_widths(loop: Any, record: Any) -> tuple[float, float]:
     known = record is not None
     reach = float(np.ptp(record.u)) if known else max(abs(float(loop.point.input)), 1.0)
     return 0.1 * reach, 0.9 * reach
+
+
+def scan_widths(effect: Any, sight: Sight) -> Scan | None:
+    """Look at a gap or a zone that is narrow beside the range of the input, and at wider ones.
+
+    Kicks of a controller make the range many times as large as what the input usually does, and a
+    width from which a climb leads to the right one may promise less than nothing by itself.
+    """
+    reach = float(np.ptp(sight.inputs))
+    widths = [w for w in (effect.width * times for times in WIDER) if w < 0.5 * reach]
+    if len(widths) < 2:
+        return None
+    return Scan((tuple(dataclasses.replace(effect, width=width) for width in widths),))
 
 
 def replace_output(e: Equations, at: str, shown: Any) -> Equations:

@@ -20,6 +20,8 @@ FASTEST = 20.0
 NEAR = 3.0
 # So many samples tell where a record starts and how fast.
 FEW = 8
+# So many first samples are followed.
+FIRST = 400
 # The search for what a backlash remembers begins at the best of so many places in its gap.
 MEMORIES = 8
 # A search starts by this share of the scale inside its bounds, as its solver demands.
@@ -33,7 +35,7 @@ LOST = 1e3
 
 def find_initial_state(
     simulator: Simulator, part: Record, r: Any, d: Array, guess: Array, fitted: int,
-    start_time: float = 0.0,
+    start_time: float = 0.0, first: int = FIRST,
 ) -> Array:  # fmt: skip
     """Return the initial state whose first entries fit the first samples best.
 
@@ -54,6 +56,8 @@ def find_initial_state(
         others are kept.
     start_time : float, optional
         Time of the first sample since the start of the experiment, which a drift counts from [s].
+    first : int, optional
+        How many samples are followed.
 
     Returns
     -------
@@ -134,7 +138,7 @@ def find_initial_state(
         return best, least
 
     # From rest a short search does not find a start that is far away.
-    count = min(len(part), 400)
+    count = min(len(part), first)
     guess, here = choose_memory(guess, count)
     seen, there = choose_memory(seen, count)
     if there is None and here is None:

@@ -1,7 +1,8 @@
 """Simulating a loop along a record: what drives it, and from where, in each valid stretch."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,9 +13,13 @@ from ..estimation.likelihood.filter_data import FEWEST
 from ..loop.controller_replay import read_references, replay_from_best_state, run_controller
 from ..loop.controller_sight import Sight, find_sight
 from ..loop.controllers import PID
-from ..loop.initial_state import find_initial_state
-from ..loop.simulation import Simulator
+from ..loop.initial_state import FEW, FIRST, find_initial_state
+from ..loop.period_map import compute_growth_rate
+from ..loop.simulation import Simulator, make_simulator
 from ..loop.wiring import knows_references
+
+# A plant that grows by itself is followed along a logged input for so many of its time constants.
+FOLLOWED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +80,9 @@ def prepare_stretch(
     is injected: what a digital controller C leaves of the measured input (pulses, dither), or the
     input about the operating point where no controller is known. The initial state of the plant is
     the one from which the simulation follows the first samples best, that of a digital controller
-    the one from which it reproduces u best.
+    the one from which it reproduces u best. Ahead of a backlash it is the one from which the plant
+    alone follows them along the measured input: the noise that a controller passes on shakes the
+    backlash loose, which a simulation without noise leaves out.
 
     Parameters
     ----------
@@ -143,6 +150,31 @@ def prepare_stretch(
         initial[fitted : fitted + len(state)] = state
         d = part.u - replayed
     time = 0.0 if start_time is None else start_time + float(record.t[samples.start] - record.start)
-    start = find_initial_state(simulator.smooth, part, r, d, initial, fitted, time)
+    if loop.controller is not None and not follow and loop.equations().play is not None:
+        start = _follow_input(simulator, part, initial, time)
+    else:
+        start = find_initial_state(simulator.smooth, part, r, d, initial, fitted, time)
     sight = find_sight(loop, part) if loop.analog and not follow else "reading"
     return Stretch(start, r, d, time, sight)
+
+
+def _follow_input(simulator: Simulator, part: Record, initial: Array, time: float) -> Array:
+    """Return an initial state from which the plant follows the first samples along their input.
+
+    What a controller remembers stays as it is.
+    """
+    loop = simulator.loop
+    plant = make_simulator(
+        replace(loop, controller=None), simulator.tolerance, simulator.most, part.hold
+    )
+    fitted = len(plant.plant_states)
+    # Behind the states of plant and controller stands what the input remembers.
+    behind = len(plant.rest) - fitted
+    guess = np.concatenate([initial[:fitted], initial[len(initial) - behind :]])
+    growth = max(compute_growth_rate(plant.loop), 0.0) * loop.dt
+    first = FIRST if growth * FIRST < FOLLOWED else max(FEW, math.ceil(FOLLOWED / growth))
+    d = part.u - loop.point.input
+    found = find_initial_state(plant.smooth, part, None, d, guess, fitted, time, first)
+    start = initial.copy()
+    start[:fitted], start[len(start) - behind :] = found[:fitted], found[fitted:]
+    return start
