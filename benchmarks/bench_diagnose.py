@@ -37,7 +37,7 @@ PURPOSES = {
     "refit_quietly": "refit quietly", "refit_under_noise": "refit",
     "prefer_sensor_noise": "noise", "find_better_choice": "look back",
     "_check_on_replicas": "replicas", "retest_with_replicas": "replicas",
-    "refit_noise": "weigh", "drop_superfluous": "weigh", "order_last_effect": "weigh",
+    "refit_noise": "weigh", "drop_superfluous": "weigh", "order_effect": "weigh",
     "weigh_effects": "weigh", "find_log_error": "log errors", "seems_idle": "log errors",
     "compare_names": "names",
     "summarize_gap": "gap",

@@ -37,7 +37,7 @@ from ctrlid.diagnosis.growth import (
 )
 from ctrlid.diagnosis.hindsight import find_better_choice
 from ctrlid.diagnosis.noise_tests import NoiseTests, _compute_force_deviates, run_noise_tests
-from ctrlid.diagnosis.ordering import order_last_effect
+from ctrlid.diagnosis.ordering import order_effect, order_trial
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.refitting import place_instants, refit_candidate, refit_under_noise
 from ctrlid.diagnosis.removal import fuse_effects, refit_without_effect, weigh_effects
@@ -1012,7 +1012,7 @@ def test_effects_at_one_place_end_in_the_order_in_which_they_act(order):
         both = loop.with_effect(found[0]).with_effect(found[1])
         own = ("InputDeadZone.width", "InputOffset.offset")
         model = fit_base_model(both, [record], (*loop.free, *own))
-        names = [type(e).__name__ for e in order_last_effect(model, given=0).fitted.effects]
+        names = [type(e).__name__ for e in order_effect(model, 1, given=0).fitted.effects]
         assert names == [type(hidden[k]).__name__ for k in order]
 
 
@@ -1027,11 +1027,45 @@ def test_a_dead_zone_ends_on_its_side_of_a_backlash(order):
         both = loop.with_effect(found[0]).with_effect(found[1])
         own = ("InputDeadZone.width", "InputBacklash.width")
         model = fit_base_model(both, [record], (*loop.free, *own))
-        fitted = order_last_effect(model, given=0).fitted
+        fitted = order_effect(model, 1, given=0).fitted
         names = [type(e).__name__ for e in fitted.effects]
         assert names == [type(hidden[k]).__name__ for k in order]
         assert fitted.labelled["InputDeadZone"].width == pytest.approx(0.3, abs=0.01)
         assert fitted.labelled["InputBacklash"].width == pytest.approx(0.2, abs=0.01)
+
+
+def test_a_candidate_is_screened_behind_and_ahead_of_what_was_found():
+    loop = drive()
+    real = loop.with_effect(E.InputBacklash(0.05)).with_effect(E.InputDeadZone(0.3))
+    record = problems.record_of(real, swing=0.3, hold=60, n=1200, seed=9980, sensor_noise=1e-4)
+    found = loop.with_effect(E.InputDeadZone(0.32))
+    base = fit_base_model(found, [record], (*loop.free, "InputDeadZone.width"))
+    narrow = E.InputBacklash(0.03)
+    behind, trial = screen_candidate(base, narrow), scan_candidate(base, narrow)
+    names = [[type(e).__name__ for e in t.model.loop.effects] for t in (behind, trial)]
+    assert names == [["InputDeadZone", "InputBacklash"], ["InputBacklash", "InputDeadZone"]]
+    assert trial.score > behind.score + 10
+    done = refit_candidate(base, trial)
+    assert done.position == 0
+    assert done.fitted.width == pytest.approx(0.05, abs=0.005)
+    # Where both are asked again, the effect that moves is the one that was added.
+    assert order_trial(base, done, given=0).model.loop.effects == done.model.loop.effects
+
+
+def test_a_gain_counts_though_a_size_is_within_its_error_of_nothing(two_found, monkeypatch):
+    f = two_found.found[0]
+    flat = Objection("insignificant", "within 2 standard errors of its neutral value")
+    monkeypatch.setattr(refitting, "find_objection", lambda trial: flat)
+    assert f.trial.gain > 100
+    assert refitting.weigh_refit(f.base, f.trial, f.trial.model.fit).out is None
+    # What the model without the effect reaches as well from there is no gain of the effect.
+    monkeypatch.setattr(refitting, "_measure_own_gain", lambda base, trial: 0.0)
+    assert refitting.weigh_refit(f.base, f.trial, f.trial.model.fit).out is flat
+    # A part that is not seen makes an effect another one, whatever it gains.
+    monkeypatch.undo()
+    part = Objection("not the simplest", "within 2 standard errors of its neutral value")
+    monkeypatch.setattr(refitting, "find_objection", lambda trial: part)
+    assert refitting.weigh_refit(f.base, f.trial, f.trial.model.fit).out is part
 
 
 @pytest.mark.parametrize("seed", [9950, 9960])
@@ -1071,10 +1105,10 @@ def test_an_order_that_makes_no_difference_is_kept():
     model = fit_base_model(loop, [record], loop.free)
     for effect in (E.CoulombFriction(0.1), E.QuadraticDrag(0.1)):
         model = refit_candidate(model, screen_at(model, effect)).model
-    assert order_last_effect(model, given=0) is model
+    assert order_effect(model, len(model.loop.effects) - 1, given=0) is model
     one = fit_base_model(loop.with_effect(E.InputOffset(0.1)), [record], loop.free)
     two = refit_candidate(one, screen_at(one, E.InputDeadZone(0.01))).model
-    assert order_last_effect(two, given=1) is two  # whose place the user knows
+    assert order_effect(two, 1, given=1) is two  # whose place the user knows
 
 
 def test_a_line_that_leaves_nothing_to_be_seen_is_no_stand_in():

@@ -26,7 +26,7 @@ from .fresh_data import FreshData
 from .hindsight import find_better_choice
 from .noise_choice import prefer_sensor_noise
 from .noise_tests import NoiseTests, choose_alarm_level, run_noise_tests
-from .ordering import order_last_effect
+from .ordering import order_effect
 from .recalibration import restore_given_values
 from .refitting import refit_candidate
 from .removal import (
@@ -139,11 +139,12 @@ def _grow_model(
     seen = 0
     while not steps or steps[-1].best is not None:
         if steps and steps[-1].best is not None:
+            best = steps[-1].best
             head = _name_round(len(steps), seen, again=bool(first))
-            tell(f"{head}: {name_with_subject(steps[-1].best.effect)} with all else")
-            reached.keep(steps[-1].base, steps[-1].best)
-            reached.model = steps[-1].best.model
-            model = refit_noise(order_last_effect(steps[-1].best.model, given))
+            tell(f"{head}: {name_with_subject(best.effect)} with all else")
+            reached.keep(steps[-1].base, best)
+            reached.model = best.model
+            model = refit_noise(order_effect(best.model, best.position, given))
             model = sharpen_model(drop_unseen_values(model, given))
             model = with_linearization(drop_superfluous(model, given))
             likeliest = max(likeliest, model, key=compute_criterion)

@@ -104,8 +104,10 @@ def find_objection(trial: Trial) -> Objection | None:
             unit = effect.units(trial.model.loop).get(about.name, "")
             words = f"{about.name} ends on its bound {fit.theta[k]:g} {unit}".rstrip()
             return Objection("on a bound", words)
+    words = f"within {THRESHOLD.significant:g} standard errors of its neutral value"
+    if _has_unseen_part(trial, effect):
+        return Objection("not the simplest", words)
     if _is_insignificant(trial, effect):
-        words = f"within {THRESHOLD.significant:g} standard errors of its neutral value"
         return Objection("insignificant", words)
     if not all(f"{trial.label}.{name}" in names for name in effect.values()):
         # A parameter that is held at its neutral value is another effect's, which excuses this one.
@@ -114,23 +116,24 @@ def find_objection(trial: Trial) -> Objection | None:
     return None if doubt is None else Objection("doubtful", doubt)
 
 
-def _is_insignificant(trial: Trial, effect: AbstractEffect) -> bool:
-    """Whether every parameter that decides about an effect may as well be neutral.
+def _has_unseen_part(trial: Trial, effect: AbstractEffect) -> bool:
+    """Whether a parameter that an effect may go without is not seen."""
+    keys = [f"{trial.label}.{p.name}" for p in effect.parameters() if p.optional]
+    fit, names = trial.model.fit, trial.model.names
+    places = [names.index(key) for key in keys if key in names]
+    return any(fit.theta[k] <= THRESHOLD.significant * fit.standard_errors[k] for k in places)
 
-    Or whether one that it may go without is not seen.
-    """
+
+def _is_insignificant(trial: Trial, effect: AbstractEffect) -> bool:
+    """Whether every parameter that decides about an effect may as well be neutral."""
     fit, names = trial.model.fit, trial.model.names
     error = fit.standard_errors
     sure = []
     for p in effect.parameters():
         key = f"{trial.label}.{p.name}"
-        if key not in names:
+        if p.neutral is None or key not in names:
             continue
         k = names.index(key)
-        if p.optional and fit.theta[k] <= THRESHOLD.significant * error[k]:
-            return True
-        if p.neutral is None:
-            continue
         away = math.inf if math.isinf(p.neutral) else abs(fit.theta[k] - p.neutral)
         sure.append(away > THRESHOLD.significant * error[k] and fit.normal[0][k, k] > 0)
     return not any(sure)

@@ -5,9 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ..effects.composition import label_effects, order_effects
-from ..estimation.likelihood.maximization import maximize
+from ..estimation.likelihood.maximization import compute_expected_gain, maximize
+from ..loop.loop import Loop
 from .candidates import Trial, attempt_trial
-from .fitted_model import Model, carry_over_fit, drop_linearization
+from .fitted_model import Model, carry_over_fit, drop_arrays, drop_linearization
 from .refitting import weigh_refit
 from .thresholds import THRESHOLD
 
@@ -20,14 +21,14 @@ def order_trial(base: Model, trial: Trial, given: int) -> Trial:
     base : Model
         The model without it.
     trial : Trial
-        The refitted candidate, the last effect of its model.
+        The refitted candidate.
     given : int
         Effects that the base had from the beginning, whose order is known.
 
     Returns
     -------
     Trial
-        As it is, or nearer to the plant.
+        As it is, or at another position.
     """
     if not trial.net_gain > 0:
         return trial
@@ -36,14 +37,46 @@ def order_trial(base: Model, trial: Trial, given: int) -> Trial:
 
 def _weigh_order(base: Model, trial: Trial, given: int) -> Trial:
     """Return the trial of `order_trial`, where nothing fails."""
-    model = order_last_effect(trial.model, given)
+    model = order_effect(trial.model, trial.position, given)
     if model is trial.model:
         return trial
     return weigh_refit(base, replace(trial, model=model), drop_linearization(model.fit))
 
 
-def order_last_effect(model: Model, given: int) -> Model:
-    """Return the model with its last effect nearer to the plant, if it fits better there.
+def screen_orders(base: Model, trial: Trial) -> Trial:
+    """Return a screened candidate where among the effects of its place it promises most.
+
+    Behind a dead zone a narrow backlash may promise nothing, and ahead of it be what is missing.
+
+    Parameters
+    ----------
+    base : Model
+        The model without it.
+    trial : Trial
+        The screened candidate, the last effect of its model.
+
+    Returns
+    -------
+    Trial
+        As it is, or at another position where it promises more by more than 3 units.
+    """
+    if trial.out is not None or not trial.model.loop.effects[-1].ordered:
+        return trial
+    best, at = trial, len(trial.model.loop.effects) - 1
+    for k in _list_other_positions(trial.model, at, 0):
+        loop, labels = _move_effect(trial.model, at, k)
+        fit = carry_over_fit(base, loop, rename_labels(trial.model.names, labels))
+        if not math.isfinite(fit.value):
+            continue
+        score = fit.value - base.fit.value + compute_expected_gain(fit)
+        if score > max(best.score, trial.score + THRESHOLD.close):
+            there = Model(loop, drop_arrays(fit))
+            best = replace(trial, label=labels[trial.label], model=there, score=score)
+    return best
+
+
+def order_effect(model: Model, at: int, given: int) -> Model:
+    """Return the model with one of its effects nearer to the plant or further off, if that fits.
 
     What is found last was found second, which says nothing of where it acts: a valve may have its
     dead zone before the offset or behind it, or before a backlash, and in the wrong order both end
@@ -52,7 +85,9 @@ def order_last_effect(model: Model, given: int) -> Model:
     Parameters
     ----------
     model : Model
-        The model to which an effect was added last.
+        The model to which an effect was added.
+    at : int
+        The position of this effect.
     given : int
         Effects that it had from the beginning, whose order is known.
 
@@ -61,17 +96,9 @@ def order_last_effect(model: Model, given: int) -> Model:
     Model
         The order that is likelier by more than 3 units, or the model as it is.
     """
-    *others, last = model.fitted.effects
-    if not last.ordered:
-        return model
-    best, count = model, len(others) + 1
-    seen = {_find_order(model, range(count))}
-    for k in range(given, len(others)):
-        order = _find_order(model, _move_last(k, count))
-        if order in seen:
-            continue
-        seen.add(order)
-        tried = move_last_effect(model, k)
+    best = model
+    for k in _list_other_positions(model, at, given):
+        tried = move_effect(model, at, k)
         if math.isfinite(tried.fit.value):
             tried = replace(
                 tried, fit=maximize(tried.fit, rounds=THRESHOLD.removal_rounds, exact=False)
@@ -80,24 +107,46 @@ def order_last_effect(model: Model, given: int) -> Model:
     return best if best.fit.value > model.fit.value + THRESHOLD.close else model
 
 
-def move_last_effect(model: Model, position: int) -> Model:
-    """Return the model with its last effect at another position among the effects, all else as is.
+def move_effect(model: Model, at: int, position: int) -> Model:
+    """Return the model with an effect at another position among the effects, all else as is.
 
     The likelihood is minus infinity if the filter cannot follow the record then.
     """
+    loop, labels = _move_effect(model, at, position)
+    return Model(loop, carry_over_fit(model, loop, rename_labels(model.names, labels)))
+
+
+def _move_effect(model: Model, at: int, position: int) -> tuple[Loop, dict[str, str]]:
+    """Return the fitted loop with an effect at another position, and the new labels of all."""
     fitted = model.fitted
-    order = _move_last(position, len(fitted.effects))
+    order = _list_places(at, position, len(fitted.effects))
     labels = list(fitted.labelled)
     loop = replace(fitted, effects=tuple(fitted.effects[k] for k in order), free=())
     renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
-    loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
-    names = rename_labels(model.names, renamed)
-    return Model(loop, carry_over_fit(model, loop, names))
+    return replace(loop, free=tuple(n for n in fitted.free if "." not in n)), renamed
 
 
-def _move_last(position: int, count: int) -> list[int]:
-    """Return places of effects, of which the last one has come to another position."""
-    return [*range(position), count - 1, *range(position, count - 1)]
+def _list_other_positions(model: Model, at: int, given: int) -> list[int]:
+    """Return positions from `given` on at which signals pass an effect in another order.
+
+    None for an effect that has no order.
+    """
+    count = len(model.loop.effects)
+    if not model.loop.effects[at].ordered:
+        return []
+    seen, found = {_find_order(model, range(count))}, []
+    for k in range(given, count):
+        order = _find_order(model, _list_places(at, k, count))
+        if order not in seen:
+            seen.add(order)
+            found.append(k)
+    return found
+
+
+def _list_places(at: int, position: int, count: int) -> list[int]:
+    """Return places of effects, of which one has come to another position."""
+    others = [k for k in range(count) if k != at]
+    return [*others[:position], at, *others[position:]]
 
 
 def _find_order(model: Model, places: Sequence[int]) -> tuple[int, ...]:

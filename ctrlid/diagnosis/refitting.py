@@ -95,7 +95,7 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     done = replace(trial, model=model, gain=fit.value - before, penalty=penalty)
     try:
         done = replace(done, out=find_objection(done))
-        if _is_undetermined(done) and _measure_own_gain(base, done) > THRESHOLD.gate:
+        if _gained_much(done) and _measure_own_gain(base, done) > THRESHOLD.gate:
             done = replace(done, out=None)
     # Fitted values may exclude each other, as a lower limit above the upper one does.
     except EffectDoesNotApply as reason:
@@ -103,20 +103,15 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     return done if done.net_gain > 0 else replace(done, model=Model(model.loop, drop_arrays(fit)))
 
 
-def _is_undetermined(trial: Trial) -> bool:
-    """Whether an effect gained much, and nothing tells how large it is there.
+def _gained_much(trial: Trial) -> bool:
+    """Whether an effect gained much though its size is within a few standard errors of nothing.
 
-    A dead zone that swallows all of the input may be any wider: its standard error is infinite, and
-    says nothing of whether it is there.
+    A standard error says how the likelihood bends at the size that was found, and not how it falls
+    towards none: a dead zone that swallows all of the input may be any wider, and a narrow backlash
+    beside a dead zone may be as narrow again, but not nothing.
     """
     insignificant = trial.out is not None and trial.out.ground == "insignificant"
-    if not (insignificant and trial.gain - trial.penalty > THRESHOLD.gate):
-        return False
-    names, information = trial.model.names, trial.model.fit.normal[0]
-    deciding = {
-        f"{trial.label}.{p.name}" for p in trial.effect.parameters() if p.neutral is not None
-    }
-    return any(information[k, k] == 0 for k, name in enumerate(names) if name in deciding)
+    return insignificant and trial.gain - trial.penalty > THRESHOLD.gate
 
 
 def _measure_own_gain(base: Model, trial: Trial) -> float:

@@ -14,6 +14,7 @@ from ..effects.context import find_output_of
 from ..estimation.likelihood.force_score import compute_force_scores
 from .candidates import Objection, Trial, attempt_trial
 from .fitted_model import Model, carry_over_fit
+from .ordering import screen_orders
 from .places import find_force_channel, find_position
 from .screening import screen_candidate, screen_starts
 from .shape_scores import score_shapes
@@ -176,10 +177,12 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
     Returns
     -------
     Trial
-        The best place; the penalty of the scan is in `scan_penalty`.
+        The best place, and the best order among the effects there are; the penalty of the scan is
+        in `scan_penalty`.
     """
     return attempt_trial(
-        lambda: _find_best_place(model, effect), Trial(effect, "", model, -math.inf)
+        lambda: screen_orders(model, _find_best_place(model, effect)),
+        Trial(effect, "", model, -math.inf),
     )
 
 
