@@ -14,7 +14,7 @@ import ctrlid as cid
 import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis import growth, refitting, removal, replicas, scans, screening, selection
-from ctrlid.diagnosis.candidates import Objection, _has_effect, contains
+from ctrlid.diagnosis.candidates import Objection, _has_effect, contains, keep_for_comparison
 from ctrlid.diagnosis.experiment import _can_survive, _list_references, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
 from ctrlid.diagnosis.fitted_model import (
@@ -24,6 +24,7 @@ from ctrlid.diagnosis.fitted_model import (
     compute_log_terms,
     drop_arrays,
     drop_linearization,
+    has_trajectories,
     takes_readings_as_exact,
     with_linearization,
 )
@@ -827,6 +828,24 @@ def test_evidence_is_against_the_likeliest_model_that_the_search_passed(
     last = max(found)
     assert found[last].trial.net_gain == pytest.approx(honest[last].trial.net_gain, abs=1.0)
     assert np.isfinite(found[last].base.fit.value)
+
+
+def test_a_model_that_was_kept_for_a_comparison_alone_can_be_carried_on(two_found, monkeypatch):
+    """One that a search passed may be the likeliest without an effect, and has no states left."""
+    model, first = two_found.final, two_found.steps[0]
+    steps = [replace(first, trials=tuple(map(keep_for_comparison, first.trials)))]
+    weigh = removal.weigh_without_effect
+
+    def fall_short(model, position):
+        smaller, trial = weigh(model, position)
+        return replace(smaller, fit=replace(smaller.fit, value=smaller.fit.value - 60)), trial
+
+    monkeypatch.setattr(removal, "weigh_without_effect", fall_short)
+    last = max(weigh_effects(model, 0, steps)[1], key=lambda f: f.position)
+    assert has_trajectories(last.base.fit)
+    assert not has_trajectories(steps[0].trials[0].model.fit)
+    assert last.base.fit.value == pytest.approx(first.best.model.fit.value, abs=0.5)
+    assert np.isfinite(screen_at(last.base, E.LinearStiffness(1.0)).score)
 
 
 def test_a_search_ends_with_the_likeliest_state_it_passed_through(monkeypatch):

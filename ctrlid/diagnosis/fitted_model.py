@@ -125,6 +125,11 @@ def drop_linearization(fit: Fit) -> Fit:
     return keep_information(fit, replace(fit, linearized=()))
 
 
+def has_trajectories(fit: Fit) -> bool:
+    """Whether a fit still has the states along its records, from which others are carried on."""
+    return bool(fit.filtered) and all(at.filtered.size for at in fit.trajectories)
+
+
 def keep_information(fit: Fit, bare: Fit) -> Fit:
     """Return a fit that lost its arrays with what had been computed from them."""
     bare.__dict__["normal"] = fit.normal

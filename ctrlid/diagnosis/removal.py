@@ -10,6 +10,7 @@ from .._base.criterion import bayesian_penalty
 from .._base.errors import ModelCannotRun
 from ..effects.base import name_with_subject
 from ..estimation.likelihood.kalman_filter import Noise
+from ..estimation.likelihood.likelihood import evaluate_likelihood, relinearize_fit
 from ..estimation.likelihood.maximization import (
     begin_fit,
     choose_noise,
@@ -26,6 +27,7 @@ from .fitted_model import (
     carry_over_fit,
     compute_criterion,
     drop_linearization,
+    has_trajectories,
     with_linearization,
 )
 from .information import estimate_need
@@ -86,7 +88,14 @@ def _find_likeliest_passed(model: Model, steps: Sequence[Round]) -> Model:
         m for m in (*(s.base for s in steps), *tried)
         if m.names == model.names and _name_effects(m) == _name_effects(model)
     ]  # fmt: skip
-    return max([model, *same], key=compute_criterion)
+    passed = max([model, *same], key=compute_criterion)
+    kept = passed.fit
+    if has_trajectories(kept):
+        return passed
+    # Of what was only kept for a comparison, they are gone.
+    fit = evaluate_likelihood(kept.problem, kept.theta, kept.noise, model.fit.trajectories)
+    restored = replace(passed, fit=drop_linearization(relinearize_fit(fit)))
+    return max(model, restored, key=compute_criterion)
 
 
 def _name_effects(model: Model) -> list[str]:
