@@ -260,6 +260,26 @@ def test_what_took_the_place_of_another_has_its_rivals():
     assert lag.net_gain > late.net_gain
     assert [t.name for t in _find_close(lag, [step])] == ["InputDelay"]
     assert [t.name for t in _find_close(late, [step])] == ["ActuatorLag"]
+    # Other starts of the same effect take nobody's place.
+    lower = replace(late, gain=late.gain - 1)
+    crowd = replace(step, trials=(lag, *[lower] * THRESHOLD.looked_at, late))
+    assert _find_close(lag, [crowd]) == [late]
+
+
+def test_what_costs_as_much_but_for_rounding_is_no_larger_model():
+    """A rival that predicts the same was left out where it was counted from another base."""
+    loop = levitation()
+    record = record_of(loop, E.ActuatorLag(1e-3), 1e-4, 1e-5, 9330)
+    lag, late = refitted(loop, record, E.ActuatorLag(5e-4), E.InputDelay(0.0))
+    assert late.net_gain < lag.net_gain
+    twin = replace(lag, effect=E.QuadraticDrag(0.0))  # no look-alike of a lag
+    assert find_rivals(lag, [twin]) == (twin,)
+    by_rounding = replace(twin, penalty=np.nextafter(np.nextafter(lag.penalty, 9e9), 9e9))
+    assert by_rounding.penalty > lag.penalty
+    assert find_rivals(lag, [by_rounding]) == (by_rounding,)
+    # One that costs more and predicts the same contains it, and pays for nothing.
+    dearer = replace(twin, penalty=lag.penalty + 4, effect=E.StribeckFriction(0.0, 1.0))
+    assert find_rivals(lag, [dearer]) == ()
 
 
 def refitted(loop, record, *candidates):

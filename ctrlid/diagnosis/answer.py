@@ -25,7 +25,7 @@ from ..loop.velocities import (
     list_possible_speeds,
     list_unforced_velocities,
 )
-from .candidates import Trial, is_same_kind
+from .candidates import Trial, has_same_penalty, is_same_kind
 from .experiment import find_experiment
 from .findings import COMPLETE, Calibrated, Candidate, Finding, SensorNoise
 from .fitted_model import with_mean_force
@@ -247,7 +247,7 @@ def _make_finding(
     ties = {
         t.key
         for t in f.rivals
-        if abs(t.gain - f.trial.gain) < THRESHOLD.tie and t.penalty == f.trial.penalty
+        if abs(t.gain - f.trial.gain) < THRESHOLD.tie and has_same_penalty(t, f.trial)
     }
     same = (*same, *sorted(ties - set(same)))
     others = tuple(t.fitted for t in f.rivals)

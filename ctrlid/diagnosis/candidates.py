@@ -15,6 +15,7 @@ from ..effects.base import name_at_place
 from ..estimation.likelihood.sampled_plant import Trajectory
 from .fitted_model import Model, keep_information
 from .places import list_placed_candidates, needs_place
+from .thresholds import THRESHOLD
 
 # A map that may run in parallel: ``work(function, items)``.
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
@@ -132,6 +133,11 @@ def is_same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
         and getattr(one, "name", "") == getattr(other, "name", "")
         and one.at == other.at
     )
+
+
+def has_same_penalty(one: Trial, other: Trial) -> bool:
+    """Whether two effects pay as much, but for the rounding of what was counted on the way."""
+    return math.isclose(one.penalty, other.penalty, rel_tol=THRESHOLD.rounding)
 
 
 def contains(effect: AbstractEffect, simple: AbstractEffect) -> bool:

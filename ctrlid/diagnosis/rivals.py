@@ -9,7 +9,7 @@ import numpy as np
 from .._base.arrays import Array
 from ..effects.base import name_at_place
 from ..estimation.likelihood.maximization import maximize
-from .candidates import Trial, Work, contains, is_same_kind
+from .candidates import Trial, Work, contains, has_same_penalty, is_same_kind
 from .fitted_model import Model, compute_criterion, compute_log_terms
 from .noise_tests import run_noise_tests
 from .ordering import order_trial
@@ -116,7 +116,8 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
             trial.gain < best.gain + THRESHOLD.close
             and _compute_spread_of_sum(mine - theirs) < THRESHOLD.same_predictions
         )
-        if trial.penalty > best.penalty and nothing and (larger or not alike):
+        dearer = trial.penalty > best.penalty and not has_same_penalty(trial, best)
+        if dearer and nothing and (larger or not alike):
             share = _compute_share_beyond(trial, best) if larger else math.nan
             hinted = (
                 alike
@@ -137,11 +138,7 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
             found.append(trial)
     found.sort(key=lambda t: -t.net_gain)
     # An effect that was started from several values is one rival.
-    return tuple(
-        t
-        for k, t in enumerate(found)
-        if not any(is_same_kind(t.effect, b.effect) for b in found[:k])
-    )
+    return tuple(_list_kinds(found))
 
 
 def compare_effects(
@@ -292,11 +289,20 @@ def _find_close(mine: Trial, steps: Sequence[Round], beside: bool = False) -> li
             if not is_same_kind(t.effect, mine.effect)
             and (
                 (t.net_gain > THRESHOLD.gate and (t.resembles(mine) or t.net_gain > least))
-                or (
-                    t.score > -math.inf
-                    and (type(t.effect) is type(mine.effect) or (beside and t.resembles(mine)))
-                )
+                or (t.score > -math.inf and (t.key == mine.key or (beside and t.resembles(mine))))
             )
         ]
-        return near[: THRESHOLD.looked_at]
+        return _list_kinds(near)[: THRESHOLD.looked_at]
     return []
+
+
+def _list_kinds(trials: Sequence[Trial]) -> list[Trial]:
+    """Return the best trial of each kind, in their order: other starts of it ask nothing more."""
+    best: list[Trial] = []
+    for t in trials:
+        k = next((k for k, b in enumerate(best) if is_same_kind(t.effect, b.effect)), None)
+        if k is None:
+            best.append(t)
+        else:
+            best[k] = max(best[k], t, key=lambda t: t.net_gain)
+    return best
