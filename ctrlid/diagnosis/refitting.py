@@ -108,10 +108,20 @@ def _gained_much(trial: Trial) -> bool:
 
     A standard error says how the likelihood bends at the size that was found, and not how it falls
     towards none: a dead zone that swallows all of the input may be any wider, and a narrow backlash
-    beside a dead zone may be as narrow again, but not nothing.
+    beside a dead zone may be as narrow again, but not nothing. An effect of several parameters
+    gains by another one then: dry friction of any size, of which only the creep is seen, is viscous
+    friction. It counts only where nothing tells how large it is.
     """
     insignificant = trial.out is not None and trial.out.ground == "insignificant"
-    return insignificant and trial.gain - trial.penalty > THRESHOLD.gate
+    if not (insignificant and trial.gain - trial.penalty > THRESHOLD.gate):
+        return False
+    names, information = trial.model.names, trial.model.fit.normal[0]
+    deciding = {
+        f"{trial.label}.{p.name}" for p in trial.effect.parameters() if p.neutral is not None
+    }
+    return len(trial.effect.values()) == 1 or any(
+        information[k, k] == 0 for k, name in enumerate(names) if name in deciding
+    )
 
 
 def _measure_own_gain(base: Model, trial: Trial) -> float:
