@@ -201,15 +201,21 @@ def advance(plant, p, e, at, x, w, t, h, push, dx, y, s1, s2, s3):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def actuate(u, k, e, at, memory, t, h, j, parts):
-    """Return what reaches the plant in part `j` of period `k`; `memory` holds lag, gap and rate."""
-    late = e[DELAY]
-    whole = int(late)
+def find_older_share(e, j, parts):
+    """Return in which share of part `j` of a period the older one of two delayed inputs acts."""
+    return min(max((e[DELAY] - int(e[DELAY])) * parts - j, 0.0), 1.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def actuate(u, k, e, at, memory, t, h, older):
+    """Return what reaches the plant in a part of period `k`; `memory` holds lag, gap and rate.
+
+    In a share of it the `older` input of a delay acts; of both the mean is taken.
+    """
+    whole = int(e[DELAY])
     w = u[k - whole] if k >= whole else at[1]
-    # The part of the step in which the older input still acts.
-    share = min(max((late - whole) * parts - j, 0.0), 1.0)
-    if share > 0.0:
-        w += share * ((u[k - whole - 1] if k > whole else at[1]) - w)
+    if older > 0.0:
+        w += older * ((u[k - whole - 1] if k > whole else at[1]) - w)
     if w < e[LOWER]:
         w = e[LOWER]
     if w > e[UPPER]:
@@ -294,9 +300,13 @@ def simulate(plant, p, e, at, x0, num, den, closed, moves, pushes, noise, period
             u[k] = moves[k] + at[1]
         h = periods[k] / SUBSTEPS
         for j in range(SUBSTEPS):
-            w = actuate(u, k, e, at, memory, t, h, j, SUBSTEPS)
-            advance(plant, p, e, at, x, w, t, h, pushes[k], a, b, c, d, f)
-            t += h
+            # A step in which a delayed input changes is two: their mean would act as a lag does.
+            share = find_older_share(e, j, SUBSTEPS)
+            for older, part in ((1.0, share * h), (0.0, (1.0 - share) * h)):
+                if part > 0.0:
+                    w = actuate(u, k, e, at, memory, t, part, older)
+                    advance(plant, p, e, at, x, w, t, part, pushes[k], a, b, c, d, f)
+                    t += part
         if not abs(x[iy] - at[2]) < reach:
             return u, y, False
     return u, y, True
@@ -458,7 +468,8 @@ def filter_record(plant, p, e, at, x0, spread, u, y, sigma, push, colour, weight
             for j in range(dim):
                 P[i, j] += cross[i] * cross[j] * (apart - gain1)
         for j in range(parts):
-            inputs[j] = actuate(u, k, e, at, memory, t + j * h, h, j, parts)
+            share = find_older_share(e, j, parts)
+            inputs[j] = actuate(u, k, e, at, memory, t + j * h, h, share)
         factorize(P, dim, L)
         new[:] = 0.0
         for s in range(2 * dim + 1):
