@@ -27,6 +27,9 @@ from ctrlid.diagnosis.gap import (
     root_mean_square,
     simulate_window,
 )
+from ctrlid.diagnosis.gap_summary import replace_divergence, summarize_gap
+from ctrlid.diagnosis.growth import Search
+from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.wording import describe_trivial, list_gap_rows
@@ -308,6 +311,26 @@ def test_a_right_name_whose_simulation_diverges_stays():
     assert found.gap.kind == "prediction"
     assert found.gap.after < 0.3 * found.gap.before
     assert "diverges on the samples kept back" in found.notes[-1]
+
+
+def test_a_simulation_that_noise_drives_further_than_the_record_moves_tells_nothing():
+    """It need not end: a ball that is lost in a magnet's equations goes on falling."""
+    loop = drive()
+    r = cid.random_binary(1200, amplitude=0.3, hold=60, seed=60)
+    record = cid.simulate(loop, r, sensor_noise=1e-3, seed=61)
+    base = fit_base_model(loop, [record], loop.free)
+    tests = run_noise_tests(base.fit)
+    search = Search(base, (), base, (), tests, tests)
+    fresh = choose_fresh_data(loop, [record], None)
+    summary = summarize_gap(loop, search, fresh)
+    kept, same = replace_divergence(loop, search, summary, fresh)
+    assert (kept, same) == (fresh, summary)
+    moves = measure_constant_error(fresh.windows)
+    lost = replace(summary, gap=replace(summary.gap, after=1.9 * moves, floor=2 * moves))
+    other, left = replace_divergence(loop, search, lost, fresh)
+    assert other.how.horizon
+    assert left.gap.kind == "prediction"
+    assert left.gap.after < 0.1 * moves
 
 
 def fresh_under_noise(real, record, names):

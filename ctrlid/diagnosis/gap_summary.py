@@ -102,9 +102,13 @@ def replace_divergence(
     """Return the gap of predictions where the simulation of the completed model diverges.
 
     Where a controller hardly holds a plant, noise alone drives the right model away from the
-    record: a simulation then tells nothing of what is missing, and would take a right name back.
+    record, by more than all that the record moves or without an end: a simulation then tells
+    nothing of what is missing, and would take a right name back.
     """
-    if fresh.how.horizon or math.isfinite(summary.gap.after):
+    if fresh.how.horizon:
+        return fresh, summary
+    lost = summary.gap.floor > gaps.measure_constant_error(fresh.windows)
+    if math.isfinite(summary.gap.after) and not lost:
         return fresh, summary
     how = choose_prediction(found.final.fitted, fresh.windows[0].record)
     ahead = lengthen_horizon(loop, found, replace(fresh, how=how))
