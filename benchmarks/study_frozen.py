@@ -307,6 +307,7 @@ def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
         ("  the same: a finding", "", write_share([bool(list_sets(x)) for x in of["clean"]])),
         ('  the same: "nothing missing"', "",
          write_share([x.get("verdict") == "nothing missing" for x in of["clean"]])),
+        *_score_rubbing(of["rubbing"]),
         (f"one effect, worth over {FOUND:g}: the truth in the set of a finding", "98 %",
          write_share([is_in_sets(x, x["truth"][0]) for x in one])),
         ("  the same, and rightly no name where nothing of the input reaches the plant", "",
@@ -341,13 +342,6 @@ def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
         ("findings, all classes: the gap wider beyond chance (1 %)", "never",
          write_share([is_wider(x) for x in drawn if list_sets(x)])),
     ]  # fmt: skip
-    if of["rubbing"]:
-        rows[3:3] = [
-            ("dry friction that the model has as well, nothing else hidden: any name", "<= 1 %",
-             write_share([bool(list_sets(x, stand_ins=True)) for x in of["rubbing"]])),
-            ('  the same: "nothing missing"', "",
-             write_share([x.get("verdict") == "nothing missing" for x in of["rubbing"]])),
-        ]  # fmt: skip
     off = [v for x in of["one"] + of["faint"] if (v := find_interval(x)) is not None]
     rows.append(("one effect, named first: the true size in its 95 % interval", ">= 90 %",
                  write_share([abs(v) < 1.96 for v in off])))  # fmt: skip
@@ -360,6 +354,18 @@ def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     rows.append(("not drawn; drawn again for want of margins", "",
                  f"{len(lines) - len(drawn)}; {sum(x['redrawn'] for x in drawn)}"))  # fmt: skip
     return rows
+
+
+def _score_rubbing(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
+    """Return the rows of what the model has as well; none for a study that did not ask it."""
+    if not lines:
+        return []
+    return [
+        ("dry friction that the model has as well, nothing else hidden: any name", "<= 1 %",
+         write_share([bool(list_sets(x, stand_ins=True)) for x in lines])),
+        ('  the same: "nothing missing"', "",
+         write_share([x.get("verdict") == "nothing missing" for x in lines])),
+    ]  # fmt: skip
 
 
 def find_power(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str, str]]:
