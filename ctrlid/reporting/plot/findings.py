@@ -228,8 +228,10 @@ def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> Non
     caption = textwrap.fill(_pictures.explain_bars(rounds), CAPTION_WIDTH)
     if caption:
         ax.annotate(
-            caption, (0, 0), (0, -CAPTION_BELOW), xycoords="axes fraction", va="top",
-            textcoords="offset points", fontsize="small", annotation_clip=False,
+            caption, (1, 0), (0, -CAPTION_BELOW), xycoords="axes fraction", va="top",
+            # Long names on the left leave the axes narrower than the text.
+            ha="right", multialignment="left", textcoords="offset points", fontsize="small",
+            annotation_clip=False,
         )  # fmt: skip
     finish_axes(ax, columns=5, size="small")
     ax.grid(False, axis="y")
