@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import control as ct
 import numpy as np
 import pytest
+from scipy import linalg
 
 import ctrlid as cid
 from ctrlid import effects as E
@@ -272,3 +273,68 @@ def test_dry_friction_of_a_cart_is_named_at_the_cart_by_its_position_alone():
     assert found.findings[0].effect.fc == pytest.approx(0.02, rel=0.05)
     assert any("F is taken for the force at v" in note for note in found.notes)
     assert found.gap.after < 1.5 * found.gap.floor
+
+
+def hoist(sign):
+    """Two masses, of which one is pulled by an input that may oppose its velocity."""
+    return ct.nlsys(
+        lambda t, x, u, p: np.array([x[2], x[3], u[0] - x[0] - p["c"] * x[2],
+                                     sign * u[1] - x[1] - p["c"] * x[3]]),
+        lambda t, x, u, p: x[:2], inputs=["Fx", "Fl"], outputs=["q", "l"],
+        states=["q", "l", "qd", "ld"], params={"c": 1.0}, name="hoist",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_friction_brakes_where_an_input_opposes_its_velocity(sign):
+    """A hoist pulls at a rope that it shortens: friction at its velocity brakes all the same."""
+    poles = []
+    for forces in (None, {"qd": "Fx", "ld": "Fl"}):
+        loop = cid.Loop(hoist(sign), None, dt=0.05, forces=forces)
+        loop = loop.with_effect(E.ViscousFriction(c=3.0, at="ld"))
+        poles.append(np.sort_complex(loop.linearize(states=True).poles()))
+    np.testing.assert_allclose(*poles, atol=1e-9)
+    assert max(poles[1].real) < 0
+
+
+def test_a_force_that_turns_with_the_state_works_along_its_velocity():
+    """A rod that pulls on one side and pushes on the other: the friction brakes on both."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[2], x[3], u[0] - x[2], p["k"] * x[0] * u[1] - x[3]]),
+        lambda t, x, u, p: x[:2], inputs=["F", "T"], outputs=["q", "w"],
+        states=["q", "w", "qd", "wd"], params={"k": 2.0}, name="rod",
+    )  # fmt: skip
+    loop = cid.Loop(plant, None, dt=0.05, forces={"qd": "F", "wd": "T"})
+    e = loop.with_effect(E.ViscousFriction(c=3.0, at="wd")).equations()
+    for q in (0.5, -0.5):
+        state = np.array([q, 0.0, 0.0, 1.0])
+        rates = e.evaluate(state, np.zeros(2))[0]
+        assert rates[3] == pytest.approx(-1.0 - 3.0 * abs(2.0 * q))
+
+
+def test_levels_with_two_pumps_are_diagnosed():
+    """Limits of a state are tried where several inputs drive it: scipy refused their matrices."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([u[0] - p["a"] * x[0], u[1] + x[0] - 2 * x[1]]),
+        lambda t, x, u, p: x, inputs=["V1", "V2"], outputs=["h1", "h2"], states=["h1", "h2"],
+        params={"a": 1.0}, name="levels",
+    )  # fmt: skip
+    rates = np.zeros((4, 4))
+    rates[:2] = [[-1.1, 0, 1, 0], [1, -2, 0, 1]]
+    step = linalg.expm(0.1 * rates)
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.choice([-1.0, 1.0], (2, 50)), 20, axis=1)
+    y, x = np.zeros((2, 1000)), np.zeros(2)
+    for k in range(1000):
+        y[:, k] = x
+        x = step[:2] @ np.concatenate([x, u[:, k]])
+    y += 0.01 * rng.standard_normal(y.shape)
+    record = cid.Record(u=u, y=y, dt=0.1, names={"u": ("V1", "V2"), "y": ("h1", "h2")})
+    loop = cid.Loop(plant, None, dt=0.1, free=("a",))
+    kinds = (E.StateLimit, E.InputOffset)
+    found = cid.diagnose(loop, record, catalogue=kinds, progress=False)
+    assert found.verdict == "nothing missing"
+    fitted = {c.name: c.after for c in found.calibrated}
+    assert fitted["a"] == pytest.approx(1.1, abs=0.01)
+    assert {c.effect.name for c in found.ranking if isinstance(c.effect, E.StateLimit)} == {
+        "h1", "h2"}  # fmt: skip

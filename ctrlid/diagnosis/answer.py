@@ -145,12 +145,6 @@ def _list_notes(loop: Loop, found: Search) -> list[str]:
     if not loop.free:
         notes.append("no parameter of the model was free, so a wrong value counts as a missing "
                      "effect. Name the uncertain parameters in free=")  # fmt: skip
-    if not e.siso:
-        notes.append(
-            "with several inputs or outputs the noise of each output is taken to be white: "
-            "coloured noise, limits of a sensor, repeats of the experiment and errors of the log "
-            "are not looked for"
-        )
     if list_unforced_velocities(e) and not found.after.passed:
         notes.append(f"{describe_missing_forces(e, loop.point)}, and diagnose again")
     speeds = list_possible_speeds(e, loop.state_units)
@@ -160,6 +154,12 @@ def _list_notes(loop: Loop, found: Search) -> list[str]:
         notes.append(
             "the model is linear. If the errors depend on position, velocity or input, write the "
             "equations of the plant with ct.nlsys and diagnose that model"
+        )
+    if not e.siso:
+        notes.append(
+            "with several inputs or outputs the noise of each output is taken to be white: "
+            "coloured noise, limits of a sensor, repeats of the experiment and errors of the log "
+            "are not looked for"
         )
     return notes
 

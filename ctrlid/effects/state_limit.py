@@ -134,7 +134,8 @@ def _find_high_value(loop: Any, record: Any, i: int) -> float:
         a, b, _, _ = compute_state_matrices(e, at)
         if np.linalg.eigvals(a).real.max() < 0:
             n = len(a)
-            sampled = signal.cont2discrete((a, b, np.eye(n), np.zeros((n, 1))), record.dt)
+            # Of several inputs the record has the first; a scan looks at limits further on.
+            sampled = signal.cont2discrete((a, b[:, :1], np.eye(n), np.zeros((n, 1))), record.dt)
             deviation = signal.dlsim(sampled, record.u - at.input)[1][:, i]
             return float(at.states[i] + np.quantile(deviation, 0.9))
     return float(at.states[i] + 0.5 * max(abs(at.states[i]), 1e-3))

@@ -13,6 +13,9 @@ from .._base.errors import CtrlidError
 
 Found = TypeVar("Found")
 
+# At so many states it is asked whether a force works along its velocity or against it.
+TURNED = 20
+
 
 @dataclass(frozen=True, eq=False)
 class Lag:
@@ -108,9 +111,10 @@ class Equations:
     that were added to the plant's own.
 
     `pushes` has a column for each force that is known to work on a velocity: the derivative of the
-    states' rates by it; `push_units` are the units of these forces, or the names of their inputs in
-    brackets, and empty for a velocity that is pushed alone. Without, each velocity is. `speeds`
-    names velocities whose position is no state, as of a drive with a tachometer.
+    states' rates by it, turned so that a positive one makes the velocity grow; `push_units` are the
+    units of these forces, or the names of their inputs in brackets, and empty for a velocity that
+    is pushed alone. Without, each velocity is. `speeds` names velocities whose position is no
+    state, as of a drive with a tachometer.
     """
 
     name: str
@@ -350,7 +354,7 @@ def drive_inputs(
                     f"forces= says that {force} works on {velocity}, but {e.name} is "
                     "not affine in it: a force enters the accelerations as it is, times a factor"
                 )
-            columns.append(slopes[:, at])
+            columns.append(_turn_forward(e, slopes[:, at], j))
         pushes = casadi.substitute(casadi.horzcat(*columns), e.u, values)
     given = [forces.get(name) for name in velocities]
     own = tuple("" if force is None else units.get(force) or f"[{force}]" for force in given)
@@ -359,6 +363,25 @@ def drive_inputs(
         output=casadi.substitute(e.output, e.u, values), pushes=pushes,
         push_units=own if by_forces else (),
     )  # fmt: skip
+
+
+def _turn_forward(e: Equations, column: Any, j: int) -> Any:
+    """Return what a force does to all rates, so that a positive one makes its velocity grow.
+
+    An input may oppose the velocity that it works on: a hoist pulls at a rope that it shortens. A
+    friction that opposes the velocity must not do so.
+    """
+    own = casadi.Function("own", [e.x, e.p, e.u, e.t], [column[j]])
+    # At rest and at some states of any size, for the sign may depend on where the mechanism is.
+    rng = np.random.default_rng(0)
+    states = [np.zeros(len(e.states)), *rng.standard_normal((TURNED, len(e.states)))]
+    slopes = np.array([float(own(x, e.values, 0, 0)) for x in states])
+    slopes = slopes[np.isfinite(slopes)]
+    if (slopes >= 0).all():
+        return column
+    if (slopes <= 0).all():
+        return -column
+    return casadi.if_else(column[j] < 0, -1.0, 1.0) * column
 
 
 def may_be_speed(e: Equations, name: str, force: str | None = None) -> bool:
