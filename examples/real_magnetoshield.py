@@ -52,7 +52,6 @@ for record in sorted(records, key=lambda r: r.y.mean()):
     x = float(record.y.mean())
     volts = [cid.operating_point(loop.system(), output=x).input for loop in (given, physics)]
     print(f"{1e3 * x:6.1f} mm{record.u.mean():11.2f}{volts[0]:11.2f}{volts[1]:11.2f}")
-    assert abs(volts[1] - record.u.mean()) < 0.5
 
 # %%
 # What the names are worth
