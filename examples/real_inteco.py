@@ -120,3 +120,13 @@ for name, loop in {"as given": given, "diagnosed": physics}.items():
 
 cid.plot.step({f"designed on the model {name}": o for name, o in outcomes.items()})
 plt.show()
+
+assert outcomes["diagnosed"].achieved.stable
+assert not outcomes["as given"].achieved.stable
+assert found.verdict == "partly explained"
+assert 0.0249 < mine.tau < 0.033
+assert abs(beside_zero - 0.0249) < 0.004
+assert found.gap.after < 0.2 * found.gap.given
+# Earlier versions named the line, and this one should.
+hum = next(f for f in found.findings if f.name == "SensorHum")
+assert abs(hum.effect.amplitude / sizes.max() - 1) < 0.2

@@ -47,11 +47,13 @@ given = cid.Loop(plant, None, dt=records[0].dt, at=at)
 physics = given.with_parameters({"K": found.loop.parameters["K"]})
 for finding in found.findings:
     physics = physics.with_effect(finding.effect)
+errors = []
 print("set-point   measured   as given   completed [V]")
 for record in sorted(records, key=lambda r: r.y.mean()):
     x = float(record.y.mean())
     volts = [cid.operating_point(loop.system(), output=x).input for loop in (given, physics)]
     print(f"{1e3 * x:6.1f} mm{record.u.mean():11.2f}{volts[0]:11.2f}{volts[1]:11.2f}")
+    errors.append(abs(volts[1] - record.u.mean()))
 
 # %%
 # What the names are worth
@@ -77,3 +79,4 @@ assert abs(next(e.delay for e in (delay.effect, *delay.alternatives)
 assert found.gap.after < 0.1 * found.gap.given
 assert outcomes["completed"].achieved.phase_margin > 29
 assert not outcomes["as given"].achieved.stable
+assert max(errors) < 0.5
