@@ -5,11 +5,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ..effects.composition import label_effects, order_effects
-from ..estimation.likelihood.maximization import compute_expected_gain, maximize
+from ..estimation.likelihood.maximization import maximize
 from ..loop.loop import Loop
 from .candidates import Trial, attempt_trial
 from .fitted_model import Model, carry_over_fit, drop_arrays, drop_linearization
 from .refitting import weigh_refit
+from .screening import compute_score
 from .thresholds import THRESHOLD
 
 
@@ -64,11 +65,9 @@ def screen_orders(base: Model, trial: Trial) -> Trial:
         return trial
     best, at = trial, len(trial.model.loop.effects) - 1
     for k in _list_other_positions(trial.model, at, 0):
-        loop, labels = _move_effect(trial.model, at, k)
+        loop, labels = _reorder_loop(trial.model, at, k)
         fit = carry_over_fit(base, loop, rename_labels(trial.model.names, labels))
-        if not math.isfinite(fit.value):
-            continue
-        score = fit.value - base.fit.value + compute_expected_gain(fit)
+        score = compute_score(base, fit)
         if score > max(best.score, trial.score + THRESHOLD.close):
             there = Model(loop, drop_arrays(fit))
             best = replace(trial, label=labels[trial.label], model=there, score=score)
@@ -98,7 +97,7 @@ def order_effect(model: Model, at: int, given: int) -> Model:
     """
     best = model
     for k in _list_other_positions(model, at, given):
-        tried = move_effect(model, at, k)
+        tried = _move_effect(model, at, k)
         if math.isfinite(tried.fit.value):
             tried = replace(
                 tried, fit=maximize(tried.fit, rounds=THRESHOLD.removal_rounds, exact=False)
@@ -107,16 +106,16 @@ def order_effect(model: Model, at: int, given: int) -> Model:
     return best if best.fit.value > model.fit.value + THRESHOLD.close else model
 
 
-def move_effect(model: Model, at: int, position: int) -> Model:
+def _move_effect(model: Model, at: int, position: int) -> Model:
     """Return the model with an effect at another position among the effects, all else as is.
 
     The likelihood is minus infinity if the filter cannot follow the record then.
     """
-    loop, labels = _move_effect(model, at, position)
+    loop, labels = _reorder_loop(model, at, position)
     return Model(loop, carry_over_fit(model, loop, rename_labels(model.names, labels)))
 
 
-def _move_effect(model: Model, at: int, position: int) -> tuple[Loop, dict[str, str]]:
+def _reorder_loop(model: Model, at: int, position: int) -> tuple[Loop, dict[str, str]]:
     """Return the fitted loop with an effect at another position, and the new labels of all."""
     fitted = model.fitted
     order = _list_places(at, position, len(fitted.effects))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
-from ..estimation.likelihood.likelihood import evaluate_likelihood
+from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood
 from ..estimation.likelihood.maximization import compute_expected_gain
 from .candidates import Objection, Trial
 from .fitted_model import Model, carry_over_fit, drop_arrays
@@ -78,8 +78,23 @@ def screen_at(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) ->
     if not math.isfinite(fit.value):
         lost = Objection("cannot run", "cannot follow the record")
         return Trial(effect, label, model, -math.inf, scan_penalty, out=lost)
-    score = fit.value - base.fit.value + compute_expected_gain(fit)
-    return Trial(effect, label, Model(loop, drop_arrays(fit)), score, scan_penalty)
+    there = Model(loop, drop_arrays(fit))
+    return Trial(effect, label, there, compute_score(base, fit), scan_penalty)
+
+
+def compute_score(base: Model, fit: Fit) -> float:
+    """Return what a larger model gains and its first step expects to; minus infinity if it is lost.
+
+    Parameters
+    ----------
+    base : Model
+        The fitted model.
+    fit : Fit
+        The model with a candidate, at its start.
+    """
+    if not math.isfinite(fit.value):
+        return -math.inf
+    return fit.value - base.fit.value + compute_expected_gain(fit)
 
 
 def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: float) -> Trial:
@@ -99,9 +114,7 @@ def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: 
         # The second pass linearizes along the states that the first one found.
         for _ in range(2):
             fit = evaluate_likelihood(start.problem, theta, start.noise, fit.trajectories)
-        if not math.isfinite(fit.value):
-            continue
-        score = fit.value - base.fit.value + compute_expected_gain(fit)
+        score = compute_score(base, fit)
         if score > best.score:
             there = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
             best = Trial(effect, label, Model(there, drop_arrays(fit)), score, scan_penalty)
