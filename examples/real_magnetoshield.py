@@ -76,7 +76,10 @@ delay = next(f for f in found.findings if "InputDelay" in f.names)
 assert found.verdict == "partly explained"
 assert abs(next(e.delay for e in (delay.effect, *delay.alternatives)
                 if type(e).__name__ == "InputDelay") / records[0].dt - 1) < 0.1  # fmt: skip
-assert found.gap.after < 0.1 * found.gap.given
+# On this rig a straight line predicts better than any model, so the floor is what counts. A version
+# that took equal readings of the converter in a row for new ones left 0.10 mm at a floor of 0.077.
+assert found.gap.after < 1.3 * found.gap.floor
+assert not any("PositionRipple" in f.names for f in (*found.findings, *found.stand_ins))
 assert outcomes["completed"].achieved.phase_margin > 29
 assert not outcomes["as given"].achieved.stable
 assert max(errors) < 0.5

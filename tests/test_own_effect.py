@@ -132,8 +132,9 @@ def test_frequency_and_period_have_the_bounds_that_they_declare():
     assert bounds_of(Waves(0.1, 6.3), record)["Waves.period"] == (0.1, 100.0)
     own = bounds_of(E.PeriodicForce(0.1, 3.0), record)["PeriodicForce.frequency"]
     np.testing.assert_allclose(own, (1 / (600 * DT), 0.4 / DT))
-    travel = bounds_of(E.PositionRipple(0.1, 0.1), record)["PositionRipple.period"][1]
-    assert 0.5 * np.ptp(record.y) < travel < 1.5 * np.ptp(record.y)
+    longest = bounds_of(E.PositionRipple(0.1, 0.1), record)["PositionRipple.period"][1]
+    # What is seen once does not repeat.
+    assert 0.25 * np.ptp(record.y) < longest < 0.75 * np.ptp(record.y)
 
 
 def test_a_period_longer_than_the_way_is_found():
