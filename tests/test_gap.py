@@ -27,7 +27,7 @@ from ctrlid.diagnosis.gap import (
     root_mean_square,
     simulate_window,
 )
-from ctrlid.diagnosis.gap_summary import replace_divergence, summarize_gap
+from ctrlid.diagnosis.gap_summary import replace_simulation, summarize_gap
 from ctrlid.diagnosis.growth import Search
 from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
@@ -313,6 +313,21 @@ def test_a_right_name_whose_simulation_diverges_stays():
     assert "diverges on the samples kept back" in found.notes[-1]
 
 
+def test_a_simulation_that_the_last_digits_decide_takes_no_name_back():
+    """Cogging strong enough to hold a mass anywhere: which of many places it stops at is chance."""
+    few = [E.PositionRipple, E.CoulombFriction]
+    case, found = diagnose_draw("one", 93057, few)
+    assert case.hidden == ("PositionRipple",)
+    assert [one.name for one in found.findings] == ["PositionRipple"]
+    amplitude, error = (
+        found.findings[0].effect.amplitude, found.findings[0].standard_errors["amplitude"]
+    )  # fmt: skip
+    assert abs(amplitude - case.sizes[0]["ripple"]) < 3 * error
+    assert found.gap.kind == "prediction"
+    assert found.gap.after < 0.2 * found.gap.before
+    assert "last digits" in found.notes[-1]
+
+
 def test_a_simulation_that_noise_drives_further_than_the_record_moves_tells_nothing():
     """It need not end: a ball that is lost in a magnet's equations goes on falling."""
     loop = drive()
@@ -323,11 +338,12 @@ def test_a_simulation_that_noise_drives_further_than_the_record_moves_tells_noth
     search = Search(base, (), base, (), tests, tests)
     fresh = choose_fresh_data(loop, [record], None)
     summary = summarize_gap(loop, search, fresh)
-    kept, same = replace_divergence(loop, search, summary, fresh)
-    assert (kept, same) == (fresh, summary)
+    kept, same, notes = replace_simulation(loop, search, summary, fresh)
+    assert (kept, same, notes) == (fresh, summary, ())
     moves = measure_constant_error(fresh.windows)
     lost = replace(summary, gap=replace(summary.gap, after=1.9 * moves, floor=2 * moves))
-    other, left = replace_divergence(loop, search, lost, fresh)
+    other, left, notes = replace_simulation(loop, search, lost, fresh)
+    assert "diverges" in notes[0]
     assert other.how.horizon
     assert left.gap.kind == "prediction"
     assert left.gap.after < 0.1 * moves

@@ -11,7 +11,7 @@ from scipy import stats
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.periods import write_both_periods
-from .._base.statistics import autocorrelation_time
+from .._base.statistics import autocorrelation_time, pseudo_inverse
 from .._base.text import write_count
 from ..data.record import Record
 from ..data.several_records import require_valid_samples
@@ -103,6 +103,34 @@ class FreshData:
         results = [self.simulate_outputs(self.prepare_loops(m)) for m in (one, other)]
         windows = gaps.share_samples(self.windows, results)
         return gaps.compute_widening_chance(windows, *results)
+
+    def measure_doubt(self, model: Model) -> Array:
+        r"""Return how far the doubt about its parameters moves what a model makes of the windows.
+
+        .. math:: \sqrt{\overline{(y(\theta_r) - y(\hat\theta))^2}}, \quad
+            \theta_r \sim N(\hat\theta, I^{-1})
+
+        One RMS difference for each draw. What is private to a record is not drawn. Zero where
+        nothing tells the doubt.
+        """
+        loops, fit = self.prepare_loops(model), model.fit
+        here = self.simulate_outputs(loops)
+        private = {f"{label}.{k}" for label, e in loops[0].labelled.items() for k in e.private}
+        if model.errors is not None or not np.isfinite(fit.normal[0]).all():
+            return np.zeros(THRESHOLD.size_runs)
+        covariance = pseudo_inverse(fit.normal[0])
+        errors = np.sqrt(np.maximum(np.diag(covariance), THRESHOLD.tiny))
+        draws = np.random.default_rng(0).multivariate_normal(
+            np.zeros(len(errors)), covariance / np.outer(errors, errors), THRESHOLD.size_runs,
+            method="eigh",
+        )  # fmt: skip
+        theta = np.clip(fit.theta + draws * errors, fit.problem.lower, fit.problem.upper)
+        found = []
+        for values in theta.tolist():
+            known = {n: v for n, v in zip(model.names, values, strict=True) if n not in private}
+            there = self.simulate_outputs([loop.with_parameters(known) for loop in loops])
+            found.append(gaps.measure_difference(self.windows, here, there))
+        return np.array(found)
 
     def measure_excess(self, loops: Sequence[Loop], fit: Fit) -> float:
         r"""Return what noise, as a fit knows it, leaves unexplained of the innovations.

@@ -103,6 +103,18 @@ def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> flo
     return math.sqrt(squares / max(count, 1))
 
 
+def measure_difference(
+    windows: Sequence[Window], one: Sequence[Array], other: Sequence[Array]
+) -> float:
+    """Return the RMS difference of two simulations on compared samples; infinite without any."""
+    squares, count = 0.0, 0
+    for window, a, b in zip(windows, one, other, strict=True):
+        use = window.mask & np.isfinite(a) & np.isfinite(b)
+        squares += float(np.sum((window.scale(a)[use] - window.scale(b)[use]) ** 2))
+        count += int(use.sum())
+    return math.sqrt(squares / count) if count else math.inf
+
+
 def share_samples(
     windows: Sequence[Window], results: Sequence[Sequence[Array]]
 ) -> tuple[Window, ...]:

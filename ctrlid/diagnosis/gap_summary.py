@@ -33,6 +33,16 @@ from .verdict import gap_is_wider
 
 Found = TypeVar("Found")
 
+DIVERGES = (
+    "the {} of the completed model diverges on the samples kept back. Where the controller hardly "
+    "holds the plant, noise alone is enough for that, so the gap is that of predictions"
+)
+DOUBTFUL = (
+    "the {} of the completed model depends on the last digits of its parameters: values within "
+    "their standard errors move it as far from the fitted ones as the record is from them, as "
+    "where a plant may come to rest in one of several places. So the gap is that of predictions"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class GapSummary:
@@ -96,24 +106,40 @@ def _find_force_unit(loop: Loop) -> str:
     return fill_unit("{x}/s", {"x": loop.state_units.get(state) or f"[{state}]"})
 
 
-def replace_divergence(
+def replace_simulation(
     loop: Loop, found: Search, summary: GapSummary, fresh: FreshData
-) -> tuple[FreshData, GapSummary]:
-    """Return the gap of predictions where the simulation of the completed model diverges.
+) -> tuple[FreshData, GapSummary, tuple[str, ...]]:
+    """Return the gap of predictions where a simulation tells nothing, and a note why it does not.
 
     Where a controller hardly holds a plant, noise alone drives the right model away from the
-    record, by more than all that the record moves or without an end: a simulation then tells
-    nothing of what is missing, and would take a right name back.
+    record, by more than all that the record moves or without an end. Where a plant may come to rest
+    in one of several places, the last digits of its parameters decide in which. Such a simulation
+    would take a right name back.
     """
-    if fresh.how.horizon:
-        return fresh, summary
-    lost = summary.gap.floor > gaps.measure_constant_error(fresh.windows)
-    if math.isfinite(summary.gap.after) and not lost:
-        return fresh, summary
+    blindness = None if fresh.how.horizon else _find_blindness(found, summary, fresh)
+    if blindness is None:
+        return fresh, summary, ()
     how = choose_prediction(found.final.fitted, fresh.windows[0].record)
     ahead = lengthen_horizon(loop, found, replace(fresh, how=how))
     other = summarize_gap(loop, found, ahead)
-    return (ahead, other) if math.isfinite(other.gap.after) else (fresh, summary)
+    if not math.isfinite(other.gap.after):
+        return fresh, summary, ()
+    return ahead, other, (blindness.format(fresh.how.name),)
+
+
+def _find_blindness(found: Search, summary: GapSummary, fresh: FreshData) -> str | None:
+    """Say why the simulation of the completed model tells nothing; None if it tells something."""
+    gap = summary.gap
+    lost = gap.floor > gaps.measure_constant_error(fresh.windows)
+    if lost or not math.isfinite(gap.after):
+        return DIVERGES
+    if not found.found or not gap_is_wider(gap, summary.disturbance):
+        return None
+    runs = np.hypot(fresh.measure_doubt(found.final), gap.floor)
+    if not np.isfinite(runs).all():
+        return DOUBTFUL
+    beyond = gaps.compute_chance_among_runs(gap.after, runs) >= 1 - THRESHOLD.beyond_chance
+    return None if beyond else DOUBTFUL
 
 
 def _summarize_several(

@@ -33,7 +33,7 @@ from .gap_summary import (
     lengthen_horizon,
     make_fresh_data_test,
     make_noise_test,
-    replace_divergence,
+    replace_simulation,
     summarize_gap,
     take_back_widening,
 )
@@ -65,11 +65,6 @@ from .several_records import merge_diagnoses
 from .sharpening import sharpen_model
 from .thresholds import THRESHOLD
 from .verdict import declare_unfinished
-
-DIVERGES = (
-    "the {} of the completed model diverges on the samples kept back. Where the controller hardly "
-    "holds the plant, noise alone is enough for that, so the gap is that of predictions"
-)
 
 WRONG_LOG = (
     "THE LOG LOOKS WRONG: {0.words}. So repaired, the record is explained better than by any "
@@ -346,8 +341,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     # Step 9: the gap before and after. An effect of one of several records may widen the others'.
     q = replace(q, fresh=q.fresh.with_noise(search.final))
     summary = summarize_gap(q.loop, search, q.fresh)
-    simulated = q.fresh.how
-    fresh, summary = replace_divergence(q.loop, search, summary, q.fresh)
+    fresh, summary, notes = replace_simulation(q.loop, search, summary, q.fresh)
     q = replace(q, fresh=fresh)
     if len(q.records) == 1 and search.finished:
         search, summary = take_back_widening(q.loop, search, summary, q.fresh)
@@ -355,8 +349,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     q.tell("writing the report")
     read = (*readout.found, *read_steps(search.final.fit, q.audits))
     result = assemble_answer(q.loop, q.records, search, summary, read)
-    if fresh.how != simulated:
-        result = replace(result, notes=(*result.notes, DIVERGES.format(simulated)))
+    result = replace(result, notes=(*result.notes, *notes))
     if search.finished and _is_worth_simulating(q, result, summary.gap, base.records):
         other = q.attempt(lambda: _answer_by_simulation(q, search, summary.gap, read), None)
         return other or (result, search)
