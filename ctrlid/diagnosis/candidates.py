@@ -135,6 +135,19 @@ def is_same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
     )
 
 
+def borrow_size(trial: Trial, best: Trial) -> AbstractEffect | None:
+    """Return an effect of the size of one that it resembles; None if they have none in common.
+
+    A lag is as long as the lag that stands for it, while its own start may be on the wrong side of
+    a hill: a long lag of the actuator looks like none at all beside the parameters as they are.
+    """
+    mine, theirs = ([p for p in t.effect.parameters() if p.neutral is not None]
+                    for t in (trial, best))  # fmt: skip
+    if not (len(mine) == len(theirs) == 1 and mine[0].unit == theirs[0].unit):
+        return None
+    return replace(trial.effect, **{mine[0].name: getattr(best.fitted, theirs[0].name)})
+
+
 def has_same_penalty(one: Trial, other: Trial) -> bool:
     """Whether two effects pay as much, but for the rounding of what was counted on the way."""
     return math.isclose(one.penalty, other.penalty, rel_tol=THRESHOLD.rounding)

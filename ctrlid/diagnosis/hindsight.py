@@ -9,6 +9,7 @@ from ..effects.base import name_at_place
 from ..estimation.likelihood.maximization import maximize
 from .candidates import Trial, Work, list_missing_candidates
 from .fitted_model import Model, compute_criterion, with_linearization
+from .noise_choice import measure_colour_gain
 from .noise_tests import run_noise_tests
 from .quiet_refitting import refit_quietly
 from .refitting import refit_candidate
@@ -23,22 +24,29 @@ def find_better_choice(
     """Return what would have been the better choice of the last round, now that more is found.
 
     Where two effects hide together, the one that alone gains most may be a mixture of both. So what
-    could have been taken in its place is asked what could follow on it; the best pair wins. Where
-    what follows on the best leaves noise alone, only its look-alikes are asked.
+    could have been taken in its place is asked what could follow on it; the best pair wins. So is
+    what could be the colour of the sensor's noise: beside a wrong effect it stays hidden. Where
+    what follows on the best leaves noise alone, only its look-alikes are asked what else follows.
     """
     if step.best is None and run_noise_tests(step.base.fit).passed:
         return None
     best = last.best
     assert best is not None
     near = last.others
-    if step.best is not None and run_noise_tests(step.best.model.fit).passed:
-        near = tuple(t for t in near if t.resembles(best) or best.resembles(t))
+    complete = step.best is not None and run_noise_tests(step.best.model.fit).passed
+    own = best.net_gain + (step.best.net_gain if step.best is not None else THRESHOLD.gate)
+    if not _has_same_sensor_noise(best.model, step.base):
+        own += max(0.0, compute_criterion(step.base) - compute_criterion(best.model))
     # Effects with a small score beside the best are not scanned again, since scans take longest.
     ranked = sorted(step.trials, key=lambda t: -t.score)
     likely = {t.key for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
     pairs: list[tuple[float, int]] = []
     for k, trial in enumerate(near):
         model, earned = _adopt_noise(trial.model, best.model, step.base)
+        least = own + THRESHOLD.gate - trial.net_gain - earned
+        pairs.append((trial.net_gain + earned + measure_colour_gain(model, least), k))
+        if complete and not (trial.resembles(best) or best.resembles(trial)):
+            continue
         pool = [c for c in list_missing_candidates(model, catalogue)
                 if not c.is_scanned() or name_at_place(c) in likely]  # fmt: skip
         tried: list[Trial] = work(lambda effect, model=model: scan_candidate(model, effect), pool)
@@ -48,9 +56,6 @@ def find_better_choice(
         follows = max((t.net_gain for t in done), default=-math.inf)
         pairs.append((trial.net_gain + earned + follows, k))
     total, k = max(pairs, default=(-math.inf, 0))
-    own = best.net_gain + (step.best.net_gain if step.best is not None else THRESHOLD.gate)
-    if not _has_same_sensor_noise(best.model, step.base):
-        own += max(0.0, compute_criterion(step.base) - compute_criterion(best.model))
     return near[k] if total > own + THRESHOLD.gate else None
 
 

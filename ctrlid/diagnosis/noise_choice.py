@@ -48,10 +48,7 @@ def prefer_sensor_noise(
         earned = best.net_gain - bayesian_penalty(parameters, fit.size)
         more = max(0.0, earned - THRESHOLD.gate)
     tried = []
-    # Of several outputs no colour is fitted.
-    if fit.plant.e.siso and fit.noise.sensor_is_white and _may_be_coloured(fit, more):
-        with contextlib.suppress(ModelCannotRun):
-            tried.append(choose_sensor_noise(fit))
+    tried += _try_colour(fit, more)
     if fit.noise.tails is None and tests.has_heavy_tails:
         heavy = choose_tails(fit)
         if not _errs_less_than_rounding(heavy):
@@ -68,6 +65,27 @@ def prefer_sensor_noise(
         # The line is taken first, and the colour is chosen anew beside it.
         return None
     return recoloured
+
+
+def measure_colour_gain(model: Model, more: float) -> float:
+    """Return what coloured sensor noise gains beside a model, less its penalty.
+
+    Zero where it gains nothing, and where it cannot gain `more`.
+    """
+    fit = model.fit
+    if fit.known is not None or not math.isfinite(fit.value) or _rounds_most(fit):
+        return 0.0
+    before = compute_noise_criterion(fit)
+    return max((compute_noise_criterion(f) - before for f in _try_colour(fit, more)), default=0.0)
+
+
+def _try_colour(fit: Fit, more: float) -> list[Fit]:
+    """Return the fit with coloured sensor noise, if that may gain so much."""
+    # Of several outputs no colour is fitted.
+    if fit.plant.e.siso and fit.noise.sensor_is_white and _may_be_coloured(fit, more):
+        with contextlib.suppress(ModelCannotRun):
+            return [choose_sensor_noise(fit)]
+    return []
 
 
 def _errs_less_than_rounding(fit: Fit) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from .._base.arrays import Array
 from ..effects.base import name_at_place
 from ..estimation.likelihood.maximization import maximize
-from .candidates import Trial, Work, contains, has_same_penalty, is_same_kind
+from .candidates import Trial, Work, borrow_size, contains, has_same_penalty, is_same_kind
 from .fitted_model import Model, compute_criterion, compute_log_terms
 from .noise_tests import run_noise_tests
 from .ordering import order_trial
@@ -190,6 +190,9 @@ def compare_effects(
             # stay short of its place, and so it may from the model with it.
             start = screen_at(bare, t.fitted if t.net_gain > THRESHOLD.gate else t.effect)
             tried = [refit_candidate(bare, start, near) for near in (None, now)]
+            borrowed = borrow_size(t, mine) if t.resembles(mine) else None
+            if borrowed is not None:
+                tried.append(refit_candidate(bare, screen_at(bare, borrowed), now))
             if contains(t.effect, mine.effect):
                 # One that contains the effect is as likely where it begins as that.
                 same = screen_at(bare, replace(t.effect, **mine.fitted.values()))
@@ -276,7 +279,8 @@ def _find_close(mine: Trial, steps: Sequence[Round], beside: bool = False) -> li
     Or that one which resembles it won, whose place it took since. Where more was found `beside` it,
     what resembles it may have come nowhere in that round, and is asked again: a lag of the actuator
     gains nothing while the curve of the input that it acts behind is missing. The same change of
-    another parameter is always asked, since a score hardly tells which of them changed.
+    another parameter is always asked, since a score hardly tells which of them changed. What may
+    have its size, as a lag has that of another lag, is asked beside however many came closer.
     """
     won = [s for s in steps if s.best is not None and s.best.key == mine.key]
     lost = [s for s in steps if s.best is not None and s.best.resembles(mine)]
@@ -292,7 +296,10 @@ def _find_close(mine: Trial, steps: Sequence[Round], beside: bool = False) -> li
                 or (t.score > -math.inf and (t.key == mine.key or (beside and t.resembles(mine))))
             )
         ]
-        return _list_kinds(near)[: THRESHOLD.looked_at]
+        each = _list_kinds(near)
+        others = each[THRESHOLD.looked_at :]
+        alike = [t for t in others if t.resembles(mine) and borrow_size(t, mine) is not None]
+        return [*each[: THRESHOLD.looked_at], *alike]
     return []
 
 

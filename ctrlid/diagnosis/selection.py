@@ -6,7 +6,15 @@ from dataclasses import dataclass, replace
 
 from ..effects import AbstractEffect
 from ..estimation.likelihood.maximization import compute_expected_gain
-from .candidates import Objection, Trial, Work, contains, is_same_kind, keep_for_comparison
+from .candidates import (
+    Objection,
+    Trial,
+    Work,
+    borrow_size,
+    contains,
+    is_same_kind,
+    keep_for_comparison,
+)
 from .fitted_model import Model, without_random_force
 from .ordering import order_trial
 from .quiet_refitting import refit_quietly
@@ -127,6 +135,9 @@ def _refit_promising(
         best = fit([(t, e, None) for t in tried
                     if id(t) in done and (t.key == winner.key or t.resembles(winner))
                     for e in t.effect.other_starts(ModelSight(base, t.effect.at))])  # fmt: skip
+        borrowed = [(t, borrow_size(t, best)) for t in tried if t.resembles(best)]
+        best = fit([(t, e, best.model) for t, e in borrowed if e is not None
+                    and done[id(t)].net_gain <= THRESHOLD.near_winner * best.net_gain])  # fmt: skip
         stuck = [t for t in _find_stuck(best, tried) if id(t) in done]
         near = without_random_force(best.model)
         fit([(t, done[id(t)].fitted, near) for t in stuck])
