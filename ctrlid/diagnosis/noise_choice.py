@@ -64,6 +64,8 @@ def prefer_sensor_noise(
     if newly_coloured and best is not None and _takes_line(other, best, model):
         # The line is taken first, and the colour is chosen anew beside it.
         return None
+    if newly_coloured and best is not None and _gains_beside_colour(other, best):
+        return None
     return recoloured
 
 
@@ -105,6 +107,20 @@ def _errs_less_than_rounding(fit: Fit) -> bool:
         if law is not None and usual[k] < rounding_variance(max(steps)):
             return True
     return False
+
+
+def _gains_beside_colour(other: Fit, best: Trial) -> bool:
+    """Whether the best effect gains at least as much beside coloured noise as it did without.
+
+    Noise that was fitted while the effect was missing leaves it little to gain: the two explain the
+    same. Where both together explain as much more, neither stands for the other, and the colour is
+    chosen beside the effect.
+    """
+    if best.net_gain <= THRESHOLD.gate:
+        return False
+    beside = with_linearization(best.model)
+    taken = compute_noise_criterion(other) - compute_noise_criterion(beside.fit)
+    return measure_colour_gain(beside, best.gain + taken) > best.gain + taken
 
 
 def _rounds_most(fit: Fit) -> bool:
