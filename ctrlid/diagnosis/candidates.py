@@ -1,5 +1,6 @@
 """What may be missing: the candidates of a catalogue, and one of them added to a model."""
 
+import contextlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -143,9 +144,11 @@ def borrow_size(trial: Trial, best: Trial) -> AbstractEffect | None:
     """
     mine, theirs = ([p for p in t.effect.parameters() if p.neutral is not None]
                     for t in (trial, best))  # fmt: skip
-    if not (len(mine) == len(theirs) == 1 and mine[0].unit == theirs[0].unit):
+    if not (len(mine) == len(theirs) == 1 and mine[0].unit == theirs[0].unit != ""):
         return None
-    return replace(trial.effect, **{mine[0].name: getattr(best.fitted, theirs[0].name)})
+    with contextlib.suppress(EffectDoesNotApply):
+        return replace(trial.effect, **{mine[0].name: getattr(best.fitted, theirs[0].name)})
+    return None
 
 
 def has_same_penalty(one: Trial, other: Trial) -> bool:
