@@ -24,9 +24,10 @@ def find_better_choice(
     """Return what would have been the better choice of the last round, now that more is found.
 
     Where two effects hide together, the one that alone gains most may be a mixture of both. So what
-    could have been taken in its place is asked what could follow on it; the best pair wins. So is
-    what could be the colour of the sensor's noise: beside a wrong effect it stays hidden. Where
-    what follows on the best leaves noise alone, only its look-alikes are asked what else follows.
+    could have been taken in its place is asked what could follow on it; the best pair wins. Where
+    what follows on the best leaves noise alone, only its look-alikes are asked that. All others are
+    asked for a colour of the sensor's noise, which stays hidden beside a wrong effect: one effect
+    and a colour may explain as much as two.
     """
     if step.best is None and run_noise_tests(step.base.fit).passed:
         return None
@@ -43,8 +44,9 @@ def find_better_choice(
     pairs: list[tuple[float, int]] = []
     for k, trial in enumerate(near):
         model, earned = _adopt_noise(trial.model, best.model, step.base)
-        least = own + THRESHOLD.gate - trial.net_gain - earned
-        pairs.append((trial.net_gain + earned + measure_colour_gain(model, least), k))
+        if complete:
+            least = own + THRESHOLD.gate - trial.net_gain - earned
+            pairs.append((trial.net_gain + earned + measure_colour_gain(model, least), k))
         if complete and not (trial.resembles(best) or best.resembles(trial)):
             continue
         pool = [c for c in list_missing_candidates(model, catalogue)
