@@ -14,7 +14,6 @@ from ctrlid.diagnosis.grounds import (
     Case,
     is_one_of_several,
     is_phase_locked,
-    may_have_no_size,
     narrows_no_gap,
     was_not_checked,
 )
@@ -212,22 +211,6 @@ def test_several_of_a_kind_in_a_wrong_model_only_describe_it():
     assert not judge(0, explained=True)
     # What the model had from the beginning is known.
     assert not judge(1, explained=False, given=mass().with_effect(ripple))
-
-
-def test_an_effect_of_several_parameters_has_a_size():
-    ripple, drag = E.PositionRipple(1.1, 1.6e-3, 0.2), E.QuadraticDrag(0.5)
-    final = SimpleNamespace(fitted=mass().with_effect(ripple).with_effect(drag))
-
-    def judge(position, **errors):
-        errors = {name.replace("_", "."): value for name, value in errors.items()}
-        case = Case(mass(), final, (), errors, None, True)
-        return may_have_no_size(case, SimpleNamespace(position=position))
-
-    assert "amplitude may as well be none" in judge(0, PositionRipple_amplitude=1.6)
-    assert not judge(0, PositionRipple_amplitude=0.1)
-    # What is not known to be uncertain, and a size alone, which the likelihood judges.
-    assert not judge(0)
-    assert not judge(1, QuadraticDrag_c2=1.0)
 
 
 def test_a_small_effect_of_a_search_that_was_stopped_was_not_checked():

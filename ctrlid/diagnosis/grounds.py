@@ -114,27 +114,6 @@ def cancels_a_known_force(case: Case, f: Weighed) -> str:
     return f"it cancels a known constant force of {write_quantity(known, unit)}"
 
 
-def may_have_no_size(case: Case, f: Weighed) -> str:
-    """Say if every size of an effect of several parameters is within its errors of having none.
-
-    The further parameters may draw a curve of which any size is as likely: a ripple whose period is
-    hardly known is any function of the position. An effect of one size is judged by the likelihood
-    without it.
-    """
-    label, effect = case.read_effect(f)
-    values = effect.values()
-    sizes = {p.name: p.neutral for p in effect.parameters() if p.neutral is not None}
-    errors = {name: case.errors.get(f"{label}.{name}", math.nan) for name in sizes}
-    if len(values) == 1 or not all(map(math.isfinite, errors.values())):
-        return ""
-    if any(
-        abs(values[name] - neutral) > THRESHOLD.significant * errors[name]
-        for name, neutral in sizes.items()
-    ):
-        return ""
-    return f"{' and '.join(sizes)} may as well be none, for all that the record says"
-
-
 def differs_between_stretches(case: Case, f: Weighed) -> str:
     """Say if the sizes from stretches that inform about it differ; an event is in one of them.
 
@@ -267,7 +246,6 @@ def was_not_checked(case: Case, f: Weighed) -> str:
 GROUNDS: tuple[Callable[[Case, Weighed], str], ...] = (
     is_at_a_limit,
     cancels_a_known_force,
-    may_have_no_size,
     differs_between_stretches,
     follows_the_reference,
     narrows_no_gap,

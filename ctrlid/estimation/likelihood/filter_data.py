@@ -1,5 +1,6 @@
 """Records prepared for the filter of a loop: signals, initial state, and where it restarts."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -291,7 +292,46 @@ def _guess_initial_state(
     wide = [max(0.1 * abs(v), reach, noise) for v in rest]
     for j in e.position_rates:
         wide[j] = speed
-    return np.array(rest), np.diag((np.array(wide) / noise) ** 2), noise
+    u = np.asarray(record.u)[record.valid]
+    drive = float(np.std(u)) + abs(float(np.mean(u)) - at.input)
+    widened = _widen_hidden_states(loop, np.array(rest), np.array(wide), np.array([drive]))
+    return np.array(rest), np.diag((widened / noise) ** 2), noise
+
+
+def _widen_hidden_states(loop: Loop, rest: Array, wide: Array, drive: Array) -> Array:
+    r"""Return how uncertain states are at first, those that nothing shows in their own unit.
+
+    .. math:: \sigma_k = \frac{1}{|a_{kk}|} \sqrt{\sum_{j \neq k} (a_{kj} \sigma_j)^2 +
+        \sum_i (b_{ki} \sigma_{u,i})^2}
+
+    at least, for a state that comes to rest by itself, as the current of a coil does. Its motion is
+    that of what drives it.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    rest, wide : ndarray, shape (n,)
+        All states at rest, and how uncertain they are by what outputs show.
+    drive : ndarray, shape (inputs,)
+        How wide each input is.
+    """
+    e = loop.equations(keep=True)
+    if e.dt:
+        return wide
+    # Wide against every kink.
+    a, b, c, _ = compute_state_matrices(e, replace(loop.point, states=tuple(rest)), spread=1e6)
+    shown = np.any(np.abs(np.atleast_2d(c)) > 0, axis=0)
+    own = len(rest) - len(e.rest)
+    hidden = [k for k in range(own)
+              if not shown[k] and k not in e.velocities and a[k, k] < 0]  # fmt: skip
+    wide = wide.copy()
+    for _ in hidden:
+        for k in hidden:
+            others = np.delete(a[k] * wide, k)
+            moved = math.sqrt(float(np.sum(others**2) + np.sum((b[k] * drive) ** 2)))
+            wide[k] = max(wide[k], moved / -a[k, k])
+    return wide
 
 
 def _guess_several_states(
@@ -327,6 +367,9 @@ def _guess_several_states(
     # What no output shows directly is as wide as the widest, whatever its unit.
     wide = np.where(wide > 0, wide, 10 * max(float(wide.max()), float(np.max(np.abs(rest)))))
     wide = np.maximum(wide, 0.1 * np.abs(rest))
+    u = np.reshape(record.u, (len(e.inputs), -1))[:, record.valid_outputs.any(axis=0)]
+    drive = np.std(u, axis=1) + np.abs(np.mean(u, axis=1) - np.array(at.inputs))
+    wide = _widen_hidden_states(loop, rest, wide, drive)
     return rest, np.diag((wide / scales[0]) ** 2), scales
 
 
