@@ -84,8 +84,11 @@ def assemble_answer(
     ]
     total = found.final.fit.value - found.base.fit.value
     total = total if math.isfinite(total) else 0.0
+    # Of effects that need each other, one may gain more than all of them beyond the model alone.
+    gains = [f.trial.gain for f in found.found]
+    gained = max(filter(math.isfinite, [total, *gains]))
     case = Case(
-        loop, found.final, records, errors, gap, found.after.passed, total, found.finished
+        loop, found.final, records, errors, gap, found.after.passed, gained, found.finished
     )  # fmt: skip
     judged = [(one, find_ground(case, f)) for one, f in zip(made, found.found, strict=True)]
     judged.sort(key=lambda pair: -pair[0].evidence)
@@ -110,8 +113,7 @@ def assemble_answer(
     left = gap_is_left(
         gap, disturbance, found.final.fit, summary.excess_chance, summary.worse_chance
     )
-    effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
-    objection = find_doubt(effects, gains, total)
+    objection = find_doubt([f.trial.effect for f in found.found], gains, total)
     objection = objection or describe_grounds(grounds)
     if not (findings or stand_ins):
         objection = blame_slow_force(disturbance, gap.force_unit)

@@ -28,8 +28,9 @@ class Case:
 
     `errors` are standard errors of the final model's parameters by name, `gap` is that on fresh
     data, and `explained` says whether the tests find noise only in what the final model leaves.
-    `gained` is the log-likelihood above that of the recalibrated model, and `finished` says whether
-    the search came to its end, where effects are compared and taken back.
+    `gained` is the log-likelihood above that of the recalibrated model, or beside the other effects
+    if one of them gains more there, and `finished` says whether the search came to its end, where
+    effects are compared and taken back.
     """
 
     given: Loop
