@@ -182,3 +182,37 @@ def test_the_share_of_the_noise_says_from_which_steps_on_a_word_is_due():
         noise = STEP / math.sqrt(12 * share)
         told = step_check.describe_unstated_steps(make_arm(), record, noise)
         assert bool(told) == (share > step_check.COARSE)
+
+
+def simulate_ball(law, seed, n=2000, step=6e-3):
+    """A ball on a beam, exactly for a held angle, whose place is read in steps of 6 mm."""
+    b, a = (np.ravel(part[0][0]) for part in (law.num, law.den))
+    rng = np.random.default_rng(seed)
+    r = 0.08 * np.repeat(rng.choice([-1.0, 1.0], n // 60 + 1), 60)[:n]
+    x = v = angle = before = 0.0
+    y, u = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        y[k] = step * round((x + 5e-4 * rng.standard_normal()) / step)
+        error = r[k] - y[k]
+        angle = (b[0] * error + b[1] * before - a[1] * angle) / a[0]
+        u[k], before = angle, error
+        push = 0.714 * 9.81 * math.sin(angle) + 0.02 * rng.standard_normal()
+        x, v = x + 0.02 * v + 0.5 * 0.02**2 * push, v + 0.02 * push
+    return cid.Record(r=r, u=u, y=y, dt=0.02)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_errors_that_differ_by_where_a_reading_sticks_differ_in_time(seed):
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], p["s"] * 9.81 * np.sin(u[0])]),
+        lambda t, x, u, p: x[0], inputs=["alpha"], outputs=["x"], states=["x", "v"],
+        params={"s": 0.68}, name="beam",
+    )  # fmt: skip
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    lead = cid.design_lead(cid.linearize(plant, at), crossover=3.0, phase_margin=50)
+    law = lead.sample(0.02, "tustin")
+    loop = cid.Loop(plant, law, dt=0.02, at=at, free=("s",))
+    few = [cid.effects.CoulombFriction, cid.effects.SensorDrift]
+    found = cid.diagnose(loop, simulate_ball(law, seed), catalogue=few, progress=False)
+    assert found.verdict == "nothing missing", found.sentence
+    assert found.loop.parameters["s"] == pytest.approx(0.714, rel=0.01)
