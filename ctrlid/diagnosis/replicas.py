@@ -199,7 +199,8 @@ def forgive_filter(tests: NoiseTests, copies: Sequence[Model | None]) -> NoiseTe
 
     A test that fails on the record, and on records simulated with the very model, says nothing
     against the model. Where the size of the errors depends on what the plant does, as it does where
-    a reading sticks to the steps of a converter, it differs in time by what the plant does then.
+    a reading sticks to the steps of a converter, it differs in time, and by the reference, by what
+    the plant does then.
     """
     bent = any(copy is not None and copy.loop.effects and has_kinks(copy) for copy in copies)
     known = [run_noise_tests(copy.fit).p_values for copy in copies if copy is not None]
@@ -207,7 +208,8 @@ def forgive_filter(tests: NoiseTests, copies: Sequence[Model | None]) -> NoiseTe
         return tests
     p = {}
     kin = {
-        f"size by time{end}": [f"size by {axis}{end}" for axis in tests.axes]
+        f"size by {outer}{end}": [f"size by {axis}{end}" for axis in tests.axes]
+        for outer in ("time", "reference")
         for end in ("", *(f" of {name}" for name in tests.outputs))
     }
     for name, value in tests.p_values.items():
