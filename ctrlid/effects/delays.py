@@ -165,8 +165,8 @@ class InputBacklash(InputEffect):
     in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("InputDeadZone", "InputDelay", "CoulombFriction")
     sentence: ClassVar[str] = (
-        "After a reversal the input moves the plant only when it has crossed a gap, as in gears or "
-        "a linkage; a valve that sticks and then jumps looks much the same."
+        "After a reversal the input moves the plant only when it has crossed a gap, as a linkage "
+        "with play has one; a valve that sticks and then jumps looks much the same."
     )
     experiment: ClassVar[str] = (
         "slow triangular inputs of several amplitudes: the hysteresis of a backlash has the same "

@@ -294,15 +294,19 @@ def _guess_initial_state(
         wide[j] = speed
     u = np.asarray(record.u)[record.valid]
     drive = float(np.std(u)) + abs(float(np.mean(u)) - at.input)
-    widened = _widen_hidden_states(loop, np.array(rest), np.array(wide), np.array([drive]))
+    widened = _widen_hidden_states(
+        loop, np.array(rest), np.array(wide), np.array([drive]), record.dt * len(record)
+    )
     return np.array(rest), np.diag((widened / noise) ** 2), noise
 
 
-def _widen_hidden_states(loop: Loop, rest: Array, wide: Array, drive: Array) -> Array:
+def _widen_hidden_states(
+    loop: Loop, rest: Array, wide: Array, drive: Array, duration: float
+) -> Array:
     r"""Return how uncertain states are at first, those that nothing shows in their own unit.
 
-    .. math:: \sigma_k = \frac{1}{|a_{kk}|} \sqrt{\sum_{j \neq k} (a_{kj} \sigma_j)^2 +
-        \sum_i (b_{ki} \sigma_{u,i})^2}
+    .. math:: \sigma_k = \min\Bigl(\frac{1}{|a_{kk}|}, t_N\Bigr) \sqrt{\sum_{j \neq k}
+        (a_{kj} \sigma_j)^2 + \sum_i (b_{ki} \sigma_{u,i})^2}
 
     at least, for a state that comes to rest by itself, as the current of a coil does. Its motion is
     that of what drives it.
@@ -315,6 +319,8 @@ def _widen_hidden_states(loop: Loop, rest: Array, wide: Array, drive: Array) -> 
         All states at rest, and how uncertain they are by what outputs show.
     drive : ndarray, shape (inputs,)
         How wide each input is.
+    duration : float
+        Length t_N of the record [s].
     """
     e = loop.equations(keep=True)
     if e.dt:
@@ -330,7 +336,7 @@ def _widen_hidden_states(loop: Loop, rest: Array, wide: Array, drive: Array) -> 
         for k in hidden:
             others = np.delete(a[k] * wide, k)
             moved = math.sqrt(float(np.sum(others**2) + np.sum((b[k] * drive) ** 2)))
-            wide[k] = max(wide[k], moved / -a[k, k])
+            wide[k] = max(wide[k], moved / max(-a[k, k], 1 / duration))
     return wide
 
 
@@ -369,7 +375,7 @@ def _guess_several_states(
     wide = np.maximum(wide, 0.1 * np.abs(rest))
     u = np.reshape(record.u, (len(e.inputs), -1))[:, record.valid_outputs.any(axis=0)]
     drive = np.std(u, axis=1) + np.abs(np.mean(u, axis=1) - np.array(at.inputs))
-    wide = _widen_hidden_states(loop, rest, wide, drive)
+    wide = _widen_hidden_states(loop, rest, wide, drive, record.dt * len(record))
     return rest, np.diag((wide / scales[0]) ** 2), scales
 
 
