@@ -333,9 +333,11 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         search = q.attempt(lambda: _search_again(q, base, search, helps, is_false), search)
     q.tell("comparing on fresh data")
     # Step 8: what else would do in the place of each effect.
+    compared = None
     if search.finished:
         q.tell("comparing names")
-        search = q.attempt(lambda: compare_names(keep_main_effects(search, helps), q.work), search)
+        compared = q.attempt(lambda: compare_names(keep_main_effects(search, helps), q.work), None)
+        search = compared or search
     # What was fitted anew has its noise measured anew.
     search = replace(search, final=measure_rounding(search.final))
     # Step 9: the gap before and after. An effect of one of several records may widen the others'.
@@ -347,6 +349,8 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         search, summary = take_back_widening(q.loop, search, summary, q.fresh)
     # Step 10: the decision table.
     q.tell("writing the report")
+    # What was not compared was not asked either whether it only stands in for something.
+    search = replace(search, finished=compared is not None)
     read = (*readout.found, *read_steps(search.final.fit, q.audits))
     result = assemble_answer(q.loop, q.records, search, summary, read)
     result = replace(result, notes=(*result.notes, *notes))
