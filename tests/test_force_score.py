@@ -97,7 +97,7 @@ def test_the_waves_that_are_looked_at_closely_hold_the_best_of_all(period, n):
     sight = ModelSight(base)
     (start,) = E.PositionRipple.candidates(base.fitted, record)
     positions, travel = sight.positions(), sight.travel
-    numbers = np.arange(2 / travel, force.LENGTHS / travel, 0.25 / travel)
+    numbers = np.arange(force.FEWEST_WAVES / travel, force.LENGTHS / travel, 0.25 / travel)
     waves = [make_waves(2 * np.pi * np.outer(w, numbers)) for w in positions]
     gains, _ = sight.score_shapes(waves, width=2)
     trial = scan_candidate(base, start)

@@ -137,14 +137,15 @@ def is_same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
 
 
 def borrow_size(trial: Trial, best: Trial) -> AbstractEffect | None:
-    """Return an effect of the size of one that it resembles; None if they have none in common.
+    """Return an effect of the size of one that it resembles; None if it does not, or has another.
 
     A lag is as long as the lag that stands for it, while its own start may be on the wrong side of
     a hill: a long lag of the actuator looks like none at all beside the parameters as they are.
     """
     mine, theirs = ([p for p in t.effect.parameters() if p.neutral is not None]
                     for t in (trial, best))  # fmt: skip
-    if not (len(mine) == len(theirs) == 1 and mine[0].unit == theirs[0].unit != ""):
+    alike = len(mine) == len(theirs) == 1 and mine[0].unit == theirs[0].unit != ""
+    if not (alike and trial.resembles(best)):
         return None
     with contextlib.suppress(EffectDoesNotApply):
         return replace(trial.effect, **{mine[0].name: getattr(best.fitted, theirs[0].name)})

@@ -113,11 +113,11 @@ class FreshData:
         One RMS difference for each draw. What is private to a record is not drawn. Zero where
         nothing tells the doubt.
         """
-        loops, fit = self.prepare_loops(model), model.fit
-        here = self.simulate_outputs(loops)
-        private = {f"{label}.{k}" for label, e in loops[0].labelled.items() for k in e.private}
+        fit = model.fit
         if model.errors is not None or not np.isfinite(fit.normal[0]).all():
             return np.zeros(THRESHOLD.size_runs)
+        loops = self.prepare_loops(model)
+        here, private = self.simulate_outputs(loops), _list_private_parameters(loops[0])
         covariance = pseudo_inverse(fit.normal[0])
         errors = np.sqrt(np.maximum(np.diag(covariance), THRESHOLD.tiny))
         draws = np.random.default_rng(0).multivariate_normal(
@@ -273,10 +273,15 @@ def check_length(fresh: FreshData) -> None:
         )
 
 
+def _list_private_parameters(loop: Loop) -> list[str]:
+    """Return the parameters of effects that differ from record to record, such as a phase."""
+    return [f"{label}.{k}" for label, e in loop.labelled.items() for k in e.private]
+
+
 def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:
     """Return the loop with what is private to a record, such as a phase, fitted to this one."""
     loop, fit = model.fitted, model.fit
-    names = [f"{label}.{k}" for label, e in loop.labelled.items() for k in e.private]
+    names = _list_private_parameters(loop)
     if not names:
         return loop
     sensor = np.full(1, float(np.mean(fit.sensor)))

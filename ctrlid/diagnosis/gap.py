@@ -95,11 +95,10 @@ def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> flo
     """Return the RMS difference on compared samples; infinite where the model gives nothing."""
     squares, count = 0.0, 0
     for window, y in zip(windows, results, strict=True):
-        use = window.mask & np.isfinite(y)
-        if window.mask.any() and not use.any():
+        square, used = _sum_squares(window, np.asarray(window.record.y), y)
+        if window.mask.any() and not used:
             return math.inf
-        squares += float(np.sum((window.measured[use] - window.scale(y)[use]) ** 2))
-        count += int(use.sum())
+        squares, count = squares + square, count + used
     return math.sqrt(squares / max(count, 1))
 
 
@@ -109,10 +108,16 @@ def measure_difference(
     """Return the RMS difference of two simulations on compared samples; infinite without any."""
     squares, count = 0.0, 0
     for window, a, b in zip(windows, one, other, strict=True):
-        use = window.mask & np.isfinite(a) & np.isfinite(b)
-        squares += float(np.sum((window.scale(a)[use] - window.scale(b)[use]) ** 2))
-        count += int(use.sum())
+        square, used = _sum_squares(window, a, b)
+        squares, count = squares + square, count + used
     return math.sqrt(squares / count) if count else math.inf
+
+
+def _sum_squares(window: Window, one: Array, other: Array) -> tuple[float, int]:
+    """Return the squared differences on compared samples, and how many samples they are of."""
+    use = window.mask & np.isfinite(one) & np.isfinite(other)
+    difference = window.scale(one)[use] - window.scale(other)[use]
+    return float(np.sum(difference**2)), int(use.sum())
 
 
 def share_samples(

@@ -47,8 +47,8 @@ def find_better_choice(
         if complete:
             least = own + THRESHOLD.gate - trial.net_gain - earned
             pairs.append((trial.net_gain + earned + measure_colour_gain(model, least), k))
-        if complete and not (trial.resembles(best) or best.resembles(trial)):
-            continue
+            if not (trial.resembles(best) or best.resembles(trial)):
+                continue
         pool = [c for c in list_missing_candidates(model, catalogue)
                 if not c.is_scanned() or name_at_place(c) in likely]  # fmt: skip
         tried: list[Trial] = work(lambda effect, model=model: scan_candidate(model, effect), pool)

@@ -36,7 +36,7 @@ def prefer_sensor_noise(
     the noise, because it is larger than the error that it explains, or because that grows with it.
     """
     fit = model.fit
-    if fit.known is not None or not math.isfinite(fit.value) or _rounds_most(fit):
+    if not _is_open_to_other_noise(fit):
         return None
     tests = run_noise_tests(fit)
     if tests.passed and not fit.noise.drift and best is None:
@@ -61,10 +61,12 @@ def prefer_sensor_noise(
     recoloured = with_linearization(Model(model.loop, other))
     if newly_coloured and is_false(recoloured, model):
         return None
-    if newly_coloured and best is not None and _takes_line(other, best, model):
-        # The line is taken first, and the colour is chosen anew beside it.
-        return None
-    if newly_coloured and best is not None and _gains_beside_colour(other, best):
+    if (
+        newly_coloured
+        and best is not None
+        and (_takes_line(other, best, model) or _gains_beside_colour(other, best))
+    ):
+        # The line or the effect is taken first, and the colour is chosen anew beside it.
         return None
     return recoloured
 
@@ -75,7 +77,7 @@ def measure_colour_gain(model: Model, more: float) -> float:
     Zero where it gains nothing, and where it cannot gain `more`.
     """
     fit = model.fit
-    if fit.known is not None or not math.isfinite(fit.value) or _rounds_most(fit):
+    if not _is_open_to_other_noise(fit):
         return 0.0
     before = compute_noise_criterion(fit)
     return max((compute_noise_criterion(f) - before for f in _try_colour(fit, more)), default=0.0)
@@ -123,9 +125,13 @@ def _gains_beside_colour(other: Fit, best: Trial) -> bool:
     return measure_colour_gain(beside, best.gain + taken) > best.gain + taken
 
 
-def _rounds_most(fit: Fit) -> bool:
-    """Whether most of a sensor's noise is the rounding of its converter, whose form is known."""
-    return bool(np.any(fit.problem.rounding > 0.5 * fit.sensor_noises))
+def _is_open_to_other_noise(fit: Fit) -> bool:
+    """Whether the form of the noise is to be found: nothing tells it, and the fit has a likelihood.
+
+    Of a sensor whose noise is mostly the rounding of its converter the form is known.
+    """
+    rounds_most = bool(np.any(fit.problem.rounding > 0.5 * fit.sensor_noises))
+    return fit.known is None and math.isfinite(fit.value) and not rounds_most
 
 
 def _takes_line(other: Fit, best: Trial, model: Model) -> bool:

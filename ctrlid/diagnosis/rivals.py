@@ -190,7 +190,7 @@ def compare_effects(
             # stay short of its place, and so it may from the model with it.
             start = screen_at(bare, t.fitted if t.net_gain > THRESHOLD.gate else t.effect)
             tried = [refit_candidate(bare, start, near) for near in (None, now)]
-            borrowed = borrow_size(t, mine) if t.resembles(mine) else None
+            borrowed = borrow_size(t, mine)
             if borrowed is not None:
                 tried.append(refit_candidate(bare, screen_at(bare, borrowed), now))
             if contains(t.effect, mine.effect):
@@ -298,7 +298,7 @@ def _find_close(mine: Trial, steps: Sequence[Round], beside: bool = False) -> li
         ]
         each = _list_kinds(near)
         others = each[THRESHOLD.looked_at :]
-        alike = [t for t in others if t.resembles(mine) and borrow_size(t, mine) is not None]
+        alike = [t for t in others if borrow_size(t, mine) is not None]
         return [*each[: THRESHOLD.looked_at], *alike]
     return []
 

@@ -135,10 +135,11 @@ def _refit_promising(
         best = fit([(t, e, None) for t in tried
                     if id(t) in done and (t.key == winner.key or t.resembles(winner))
                     for e in t.effect.other_starts(ModelSight(base, t.effect.at))])  # fmt: skip
-        behind = [t for t in tried if id(t) in done and t.resembles(best) and best.net_gain > 0
-                  and done[id(t)].net_gain <= THRESHOLD.near_winner * best.net_gain]  # fmt: skip
-        borrowed = [(t, borrow_size(t, best), best.model) for t in behind]
-        best = fit([(t, e, near) for t, e, near in borrowed if e is not None])
+        least = THRESHOLD.near_winner * best.net_gain
+        behind = [t for t in tried if id(t) in done and best.net_gain > 0
+                  and done[id(t)].net_gain <= least]  # fmt: skip
+        borrowed = [(t, borrow_size(t, best)) for t in behind]
+        best = fit([(t, e, best.model) for t, e in borrowed if e is not None])
         stuck = [t for t in _find_stuck(best, tried) if id(t) in done]
         near = without_random_force(best.model)
         fit([(t, done[id(t)].fitted, near) for t in stuck])

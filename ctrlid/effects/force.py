@@ -23,6 +23,8 @@ from .scanning import (
     scan_line,
 )
 
+# What the travel shows fewer times than this does not repeat.
+FEWEST_WAVES = 2
 # Wavelengths shorter than the travel over this number are not scanned, to save time.
 LENGTHS = 150
 # A wave is scanned if the motion is slow enough for it at this share of the samples.
@@ -296,7 +298,7 @@ class PositionRipple(ForceEffect):
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Keep two periods within the travel: what is seen once does not repeat."""
-        return {"period": (-math.inf, seen.travel / 2)}
+        return {"period": (-math.inf, seen.travel / FEWEST_WAVES)}
 
     def scan(self, sight: Sight) -> Scan:
         """Look at all wavelengths that the travel can show, and then finely at the best of them.
@@ -307,14 +309,14 @@ class PositionRipple(ForceEffect):
         step = max(float(np.quantile(np.abs(np.diff(w)), SLOW_SHARE)) for w in positions)
         grain = max(_find_quantization_step(y) for y in sight.outputs)
         shortest = max(travel / LENGTHS, 4 * step, 4 * grain)
-        if not travel > 4 * shortest:
+        if not travel > 2 * FEWEST_WAVES * shortest:
             return Scan((), remark="the motion is too small to show a ripple")
         finest = 0.25 / travel
-        places = max((1.0 / shortest - 2.0 / travel) * travel, 1)
+        places = max((1.0 / shortest - FEWEST_WAVES / travel) * travel, 1)
 
         # A peak is about one over the travel wide: only those that may be the highest are seen
         # finely.
-        numbers = np.arange(2.0 / travel, 1.0 / shortest, finest)
+        numbers = np.arange(FEWEST_WAVES / travel, 1.0 / shortest, finest)
         likely = _find_peaks(_guess_gains(sight, positions, numbers[::2]), 0.0, 4 * PEAKS)
         near = np.unique(np.add.outer(2 * np.array(likely), (-1, 0, 1)))
         near = near[(near >= 0) & (near < len(numbers))]

@@ -292,17 +292,11 @@ def _guess_initial_state(
     wide = [max(0.1 * abs(v), reach, noise) for v in rest]
     for j in e.position_rates:
         wide[j] = speed
-    u = np.asarray(record.u)[record.valid]
-    drive = float(np.std(u)) + abs(float(np.mean(u)) - at.input)
-    widened = _widen_hidden_states(
-        loop, np.array(rest), np.array(wide), np.array([drive]), record.dt * len(record)
-    )
+    widened = _widen_hidden_states(loop, record, np.array(rest), np.array(wide))
     return np.array(rest), np.diag((widened / noise) ** 2), noise
 
 
-def _widen_hidden_states(
-    loop: Loop, rest: Array, wide: Array, drive: Array, duration: float
-) -> Array:
+def _widen_hidden_states(loop: Loop, record: Record, rest: Array, wide: Array) -> Array:
     r"""Return how uncertain states are at first, those that nothing shows in their own unit.
 
     .. math:: \sigma_k = \min\Bigl(\frac{1}{|a_{kk}|}, t_N\Bigr) \sqrt{\sum_{j \neq k}
@@ -315,19 +309,20 @@ def _widen_hidden_states(
     ----------
     loop : Loop
         The loop.
+    record : Record
+        What tells how wide each input is, and the length :math:`t_N` [s].
     rest, wide : ndarray, shape (n,)
         All states at rest, and how uncertain they are by what outputs show.
-    drive : ndarray, shape (inputs,)
-        How wide each input is.
-    duration : float
-        Length t_N of the record [s].
     """
     e = loop.equations(keep=True)
     if e.dt:
         return wide
+    u = np.reshape(record.u, (len(e.inputs), -1))[:, record.valid_outputs.any(axis=0)]
+    drive = np.std(u, axis=1) + np.abs(np.mean(u, axis=1) - np.array(loop.point.inputs))
+    slowest = 1 / (record.dt * len(record))
     # Wide against every kink.
     a, b, c, _ = compute_state_matrices(e, replace(loop.point, states=tuple(rest)), spread=1e6)
-    shown = np.any(np.abs(np.atleast_2d(c)) > 0, axis=0)
+    shown = np.any(c != 0, axis=0)
     own = len(rest) - len(e.rest)
     hidden = [k for k in range(own)
               if not shown[k] and k not in e.velocities and a[k, k] < 0]  # fmt: skip
@@ -336,7 +331,7 @@ def _widen_hidden_states(
         for k in hidden:
             others = np.delete(a[k] * wide, k)
             moved = math.sqrt(float(np.sum(others**2) + np.sum((b[k] * drive) ** 2)))
-            wide[k] = max(wide[k], moved / max(-a[k, k], 1 / duration))
+            wide[k] = max(wide[k], moved / max(-a[k, k], slowest))
     return wide
 
 
@@ -373,9 +368,7 @@ def _guess_several_states(
     # What no output shows directly is as wide as the widest, whatever its unit.
     wide = np.where(wide > 0, wide, 10 * max(float(wide.max()), float(np.max(np.abs(rest)))))
     wide = np.maximum(wide, 0.1 * np.abs(rest))
-    u = np.reshape(record.u, (len(e.inputs), -1))[:, record.valid_outputs.any(axis=0)]
-    drive = np.std(u, axis=1) + np.abs(np.mean(u, axis=1) - np.array(at.inputs))
-    wide = _widen_hidden_states(loop, rest, wide, drive, record.dt * len(record))
+    wide = _widen_hidden_states(loop, record, rest, wide)
     return rest, np.diag((wide / scales[0]) ** 2), scales
 
 
