@@ -22,6 +22,7 @@ sixth, and not at all in the rest.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,11 +66,15 @@ HOSTS = {
     "SensorHum": ANY,
     # No limit of the sensor: readings that sit on it are read off the log, and no filter weighs it.
 }  # fmt: skip
+# Draws of earlier seeds hide what the catalogue had then, and nothing of it was outside.
+LATER = {"InputRateLimit": (96000, ANY)}
 OUTSIDE = {
     "rate limit": ANY, "changing lag": ANY, "cubic drag": MECHANICAL, "soft stop": MECHANICAL,
     "hysteresis": MECHANICAL, "loss of gain": ANY, "play of the sensor": ANY,
     "growing noise": ANY,
 }  # fmt: skip
+# What was outside until the catalogue had it.
+ENTERED = {"rate limit": "InputRateLimit"}
 # Names that no record can tell apart, by plants.
 SAME = (
     ({"ActuatorLag", "SensorLag"}, ("drive", "spring")),
@@ -360,7 +365,8 @@ def make_effect(rng: np.random.Generator, name: str, rig: Rig, n: int) -> tuple[
         "SensorDrift": ({}, one("sensor_drift", sign * 3 * rig.sigma / end), "sensor_drift"),
         "SensorHum": ({"hum_f": float(rng.uniform(0.05, 0.45)) / dt, "hum_phase": phase},
                       one("hum", 0.3 * rig.sigma), "hum"),
-        "rate limit": ({}, lambda s: {"rate": span / dt / (0.5 + s)}, ""),
+        **dict.fromkeys(("rate limit", "InputRateLimit"),
+                        ({}, lambda s: {"rate": span / dt / (0.5 + s)}, "")),
         "changing lag": ({"changing_f": hertz * rng.uniform(0.05, 0.3)}, one("changing", dt), ""),
         "cubic drag": ({}, one("cubic_drag", 0.1 * a / v**3), "cubic_drag"),
         "soft stop": ({"reach": 0.6 * rig.swing}, one("soft_stop", 0.3 * rig.bandwidth**2),
@@ -414,6 +420,14 @@ def draw_case(name: str, seed: int, n: int = 1500) -> Case:
     raise RuntimeError(f"no stable draw of {name} with seed {seed} in {TRIES} tries")
 
 
+def list_hosts(name: str, seed: int) -> dict[str, Sequence[str]]:
+    """Return what a draw of a class may hide, each with the plants that may have it."""
+    later = {k: plants for k, (first, plants) in LATER.items() if seed >= first}
+    if name != "outside":
+        return {**HOSTS, **later}
+    return {k: plants for k, plants in OUTSIDE.items() if ENTERED.get(k) not in later}
+
+
 def _fill_rig(
     rng: np.random.Generator, name: str, seed: int, rig: Rig, kind: str, n: int, attempt: int
 ) -> Case | None:
@@ -463,7 +477,7 @@ def _fill_rig(
         sizes.append({key: factor})
         rig = told
     elif name != "clean":
-        host = OUTSIDE if name == "outside" else HOSTS
+        host = list_hosts(name, seed)
         count = {"two": 2, "three": 3}.get(name, 1)
         able = [k for k, where in host.items() if rig.plant in where]
         # Every name in turn, so that no class of effects is rare.

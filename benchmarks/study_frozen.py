@@ -69,6 +69,7 @@ SIZES: dict[str, tuple[str, Callable[[dict[str, float], float], float]]] = {
     "ActuatorLag": ("tau", lambda v, dt: v["lag"]),
     "InputDeadZone": ("width", lambda v, dt: v["deadzone"]),
     "InputBacklash": ("width", lambda v, dt: v["backlash"]),
+    "InputRateLimit": ("rate", lambda v, dt: v["rate"]),
     "InputNonlinearity": ("curvature", lambda v, dt: v["curvature"]),
     "InputSaturatingGain": ("saturation", lambda v, dt: v["saturation"]),
     "ViscousFriction": ("c", lambda v, dt: v["viscous"]),

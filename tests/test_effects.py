@@ -335,7 +335,7 @@ class Wrong(effects.LawEffect):
 
 
 def test_the_catalogue_is_explicit_and_public():
-    assert len(set(CATALOGUE)) == len(CATALOGUE) == 35
+    assert len(set(CATALOGUE)) == len(CATALOGUE) == 36
     for cls in CATALOGUE:
         assert getattr(effects, cls.__name__) is cls
         assert cls.__name__ in effects.__all__

@@ -18,8 +18,8 @@ from scipy import integrate, linalg, signal
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.estimation.likelihood import kalman_recursion
-from ctrlid.estimation.likelihood.backlash import InputRange
 from ctrlid.estimation.likelihood.filter_data import find_rest_state, make_filter_data
+from ctrlid.estimation.likelihood.input_memory import InputRange
 from ctrlid.estimation.likelihood.kalman_filter import (
     Noise,
     PassArguments,

@@ -289,7 +289,7 @@ def test_the_system_of_a_loop_is_a_plant_again():
 
 def test_what_is_no_continuous_state_is_refused_or_approximated():
     loop = levitated()
-    with pytest.raises(cid.CtrlidError, match="InputBacklash has a memory"):
+    with pytest.raises(cid.CtrlidError, match="has a memory"):
         loop.with_effect(E.InputBacklash(0.1)).system()
     late = loop.with_effect(E.InputDelay(0.004))
     assert late.system().nstates == 4
@@ -716,7 +716,7 @@ def test_derivatives_at_neutral_are_finite():
         for effect in cls.candidates(loop)[:1]:
             neutral = {p.name: p.neutral for p in cls.parameters() if p.neutral is not None}
             e = loop.with_effect(type(effect)(**{**vars(effect), **neutral})).equations(keep=True)
-            if e.delay is None and e.play is None and not effect.states:
+            if e.delay is None and e.memory is None and not effect.states:
                 f = e.smoothed.jacobian()
                 shape = [np.zeros(e.smoothed.size_out(k)) for k in range(2)]
                 for v, s in ((0.0, 0.0), (0.01, 0.0), (0.0, 0.01)):

@@ -8,6 +8,7 @@ from ..effects import (
     CoulombFriction,
     InputBacklash,
     InputDeadZone,
+    InputRateLimit,
     InputSaturation,
     StribeckFriction,
 )
@@ -122,8 +123,9 @@ def _explain_limits(loop: Loop) -> list[str]:
         for name, low, high in zip(inputs, lower, upper, strict=True)
         if np.isfinite([low, high]).any()
     ]
-    names = [k for k, e in loop.labelled.items() if isinstance(e, InputSaturation)]
-    return found + [f"{name} limits the input" for name in names]
+    for kind, said in ((InputSaturation, "limits the input"), (InputRateLimit, "limits its speed")):
+        found += [f"{k} {said}" for k, e in loop.labelled.items() if isinstance(e, kind)]
+    return found
 
 
 def _explain_bends(loop: Loop) -> list[str]:

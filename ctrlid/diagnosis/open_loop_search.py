@@ -217,7 +217,7 @@ def _screen_effect(now: Simulated, effect: AbstractEffect) -> Tried | None:
             if task is None:
                 task = now.task.with_loop(loop, names)
             # The sensitivities of a backlash need another recursion than that of the states.
-            if task.plant.e.play is not None:
+            if task.plant.e.memory is not None:
                 return None
             theta = np.array([*now.theta, *own.values()])
             theta = np.clip(theta, task.problem.lower, task.problem.upper)

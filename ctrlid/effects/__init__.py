@@ -7,7 +7,7 @@ from .._base.text import find_near_name
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
 from .context import Moment
-from .delays import ActuatorLag, InputBacklash, InputDelay
+from .delays import ActuatorLag, InputBacklash, InputDelay, InputRateLimit
 from .equivalence import equivalents
 from .force import (
     ConstantForce,
@@ -69,6 +69,7 @@ __all__ = [
     "InputEffect",
     "InputNonlinearity",
     "InputOffset",
+    "InputRateLimit",
     "InputSaturatingGain",
     "InputSaturation",
     "LawEffect",

@@ -1,7 +1,7 @@
 """Every effect that a diagnosis tries, as an explicit tuple of classes."""
 
 from .base import AbstractEffect
-from .delays import ActuatorLag, InputBacklash, InputDelay
+from .delays import ActuatorLag, InputBacklash, InputDelay, InputRateLimit
 from .force import (
     ConstantForce,
     CubicStiffness,
@@ -47,6 +47,7 @@ CATALOGUE: tuple[type[AbstractEffect], ...] = (
     InputDeadZone,
     InputOffset,
     InputBacklash,
+    InputRateLimit,
     InputNonlinearity,
     InputSaturatingGain,
     ViscousFriction,

@@ -11,8 +11,7 @@ import numpy as np
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
 from .base import AbstractEffect
-from .delays import InputBacklash
-from .kinds import ForceEffect, InputEffect, LawEffect, OutputEffect, ReadingEffect
+from .kinds import ForceEffect, InputEffect, LawEffect, MemoryEffect, OutputEffect, ReadingEffect
 
 # These builds call a hook that sees symbols only, so that no formula depends on a value.
 BUILDS = {kind.build for kind in (LawEffect, ForceEffect, InputEffect, OutputEffect, ReadingEffect)}
@@ -45,8 +44,9 @@ def order_effects(effects: Mapping[str, AbstractEffect]) -> tuple[tuple[str, Abs
     """Return effects in the order in which they are put into equations, from the plant outwards.
 
     Of those at the same place the one given last is furthest from the plant. What bends or limits
-    the input and is given after a backlash acts ahead of it, as the overlap of a valve does that a
-    linkage with play comes behind; a lag does not, for a backlash passes once per sample.
+    the input and is given after a backlash (or a largest speed) acts ahead of it, as the overlap of
+    a valve does that a linkage with play comes behind; a lag does not, for a backlash passes once
+    per sample.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def order_effects(effects: Mapping[str, AbstractEffect]) -> tuple[tuple[str, Abs
     found: list[tuple[int, str, AbstractEffect]] = []
     stage_of_curves = InputEffect.stage
     for label, effect in effects.items():
-        if isinstance(effect, InputBacklash):
+        if isinstance(effect, MemoryEffect):
             stage_of_curves = effect.stage
         curve = isinstance(effect, InputEffect) and not effect.states
         ahead = curve and effect.stage == InputEffect.stage

@@ -1,16 +1,18 @@
-"""Lag, delay and backlash between the controller and the plant."""
+"""Lag, delay, backlash and limited rate between the controller and the plant."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self, final
 
 import casadi
+import numpy as np
 
 from .._base.errors import EffectDoesNotApply
-from ..physics.equations import Backlash, Equations
+from ..physics.equations import Equations, InputMemory
 from ..physics.linearization import OperatingPoint
 from .context import Moment
-from .kinds import InputEffect, choose_widths, require_one_input, scan_widths
+from .kinds import InputEffect, MemoryEffect, choose_widths, scan_widths
 from .parameters import parameter
 from .scanning import Range, Scan, Sight
 from .symbolic import to_expression
@@ -137,7 +139,7 @@ class InputDelay(InputEffect):
 
 @final
 @dataclass(frozen=True)
-class InputBacklash(InputEffect):
+class InputBacklash(MemoryEffect):
     r"""Backlash of the input, before the plant.
 
     .. math:: m_{k} = \min(\max(m_{k-1}, u_k - w/2), u_k + w/2), \quad u_a = m_k
@@ -161,8 +163,6 @@ class InputBacklash(InputEffect):
 
     width: float = parameter("{u}", lower=0.0, neutral=0.0)
 
-    stage: ClassVar[int] = 6
-    in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("InputDeadZone", "InputDelay", "CoulombFriction")
     sentence: ClassVar[str] = (
         "After a reversal the input moves the plant only when it has crossed a gap, as a linkage "
@@ -183,19 +183,84 @@ class InputBacklash(InputEffect):
         """Look at a few widths."""
         return scan_widths(self, sight)
 
-    @classmethod
-    def is_scanned(cls) -> bool:
-        """Say no: a few widths hardly take longer than one."""
-        return False
-
-    def build(self, e: Equations, m: Moment) -> Equations:
-        """Return the equations with the backlash ahead of them."""
-        require_one_input(self, e)
-        if e.play is not None:
-            raise EffectDoesNotApply(
-                "there is a backlash already; one loop takes a single InputBacklash"
-            )
-        memory, u = casadi.SX.sym("m"), casadi.SX.sym("u")
+    def remember(self, memory: Any, u: Any, period: Any, at_rest: Any) -> InputMemory:
+        """Return the gap, in which the memory stays where it is."""
         half = to_expression(self.width) / 2
         after = casadi.fmin(casadi.fmax(memory, u - half), u + half)
-        return dataclasses.replace(e, play=Backlash(memory, u, after, after, u, half))
+        return InputMemory(memory, u, period, at_rest, after, after, u, half)
+
+
+# A largest speed is looked for where it holds back all but these shares of the steps of the input.
+REACHED = (0.999, 0.99, 0.95, 0.8, 0.5)
+
+
+@final
+@dataclass(frozen=True)
+class InputRateLimit(MemoryEffect):
+    r"""The actuator moves at a limited speed.
+
+    .. math:: m_{k+1} = m_k + \min(\max(u_k - m_k, -RT), RT)
+
+    The actuator runs from where it is towards the computed input at the speed R, and waits where it
+    arrives. Of a held input the plant gets the mean over the sampling period T,
+
+    .. math:: u_a = m_k + \Delta - \frac{\Delta |\Delta|}{2RT}, \quad \Delta = m_{k+1} - m_k,
+
+    which moves a velocity exactly as the ramp does. The servo of a rudder or an elevator, a valve
+    with a motor.
+
+    Parameters
+    ----------
+    rate : float
+        The largest speed R [input unit/s]; infinite for none.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.InputRateLimit(rate=0.5))
+    InputRateLimit: rate = 0.5 [u]/s
+    """
+
+    rate: float = parameter("{u}/s", lower=0.0, neutral=math.inf)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("ActuatorLag", "InputDelay", "InputSaturation")
+    sentence: ClassVar[str] = "The speed of the actuator is limited."
+    experiment: ClassVar[str] = (
+        "small and large steps of the input: at a largest speed the larger step takes longer, "
+        "while a lag takes as long for both"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a speed that holds back some of the steps of the recorded input."""
+        if record is None:
+            return cls._applicable(loop, cls(rate=max(abs(float(loop.point.input)), 1.0) / loop.dt))
+        known = record.u[..., record.valid] if record.u.ndim == 1 else record.u
+        rates = _find_rates(known, loop.dt)
+        return cls._applicable(loop, cls(rate=rates[len(rates) // 2])) if rates else ()
+
+    def scan(self, sight: Sight) -> Scan | None:
+        """Look at speeds that hold back few or many of the steps of the input."""
+        rates = _find_rates(sight.inputs, sight.dt)
+        if not rates:
+            return None
+        starts = tuple(dataclasses.replace(self, rate=rate) for rate in rates)
+        return Scan((starts,), places=len(starts))
+
+    def remember(self, memory: Any, u: Any, period: Any, at_rest: Any) -> InputMemory:
+        """Return the way at the largest speed; where a record begins, it may be under way."""
+        most = to_expression(self.rate) * period
+        step = casadi.fmin(casadi.fmax(u - memory, -most), most)
+        # At a speed of zero nothing moves, and nothing is divided by it.
+        lost = step * casadi.fabs(step) / (2 * most + np.finfo(float).tiny)
+        start, reach = (u + at_rest) / 2, casadi.fabs(u - at_rest) / 2
+        after = memory + step
+        return InputMemory(memory, u, period, at_rest, after, after - lost, start, reach)
+
+
+def _find_rates(u: Any, dt: float) -> list[float]:
+    """Return speeds that hold back few or many of the steps of an input, the fastest first."""
+    steps = np.abs(np.diff(u))
+    if not steps.size:
+        return []
+    return [float(step) / dt for step in np.quantile(steps, REACHED) if step > 0]

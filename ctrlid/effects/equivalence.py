@@ -204,7 +204,7 @@ def _find_scaled(loop: Any, others: Sequence[AbstractEffect]) -> set[str]:
             changed = there.equations(keep=True)
         except EffectDoesNotApply:
             continue
-        if changed.delay is not None or changed.play is not None:
+        if changed.delay is not None or changed.memory is not None:
             continue
         unknown = [*own, f"{list(there.labelled)[-1]}.{key}"]
         if unknown[-1] in changed.parameters and _can_reproduce(changed, unknown, points, rates):
@@ -356,7 +356,7 @@ def _compute_change(loop: Any, effect: AbstractEffect, size: float) -> Array | N
     except EffectDoesNotApply:
         return None
     e = changed.equations(keep=True)
-    if e.delay is not None or e.play is not None:
+    if e.delay is not None or e.memory is not None:
         return None
     return _evaluate_at_points(e, loop.point) - _evaluate_at_points(loop.equations(), loop.point)
 

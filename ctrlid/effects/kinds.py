@@ -7,7 +7,7 @@ import casadi
 import numpy as np
 
 from .._base.errors import EffectDoesNotApply
-from ..physics.equations import Backlash, Equations
+from ..physics.equations import Equations, InputMemory
 from ..physics.integration import put_entry
 from ..physics.symbols import Symbol
 from .base import AbstractEffect, Place, refuse_missing_formula, require_motion
@@ -87,8 +87,8 @@ class InputEffect(AbstractEffect):
         applied = to_expression(trace_hook(self.input)(m))
         if len(e.inputs) > 1:
             applied = put_entry(e.u, e.inputs.index(self.at), applied)
-        if e.play is not None and not _depends_on_others(applied, e):
-            return _put_ahead_of_backlash(e, e.play, applied)
+        if e.memory is not None and not _depends_on_others(applied, e):
+            return _put_ahead_of_memory(e, e.memory, applied)
         return substitute_symbol(e, e.u, applied)
 
 
@@ -97,15 +97,44 @@ def _depends_on_others(applied: Any, e: Equations) -> bool:
     return bool(casadi.depends_on(applied, casadi.vertcat(e.t, e.x, casadi.vec(e.spread))))
 
 
-def _put_ahead_of_backlash(e: Equations, play: Backlash, bent: Any) -> Equations:
-    """Return equations whose backlash follows the input as it is bent, in place of the input."""
-    bent = casadi.substitute(casadi.SX(bent), e.u, play.u)
-    after, applied, start = (
-        casadi.substitute(casadi.SX(value), play.u, bent)
-        for value in (play.after, play.applied, play.start)
+def _put_ahead_of_memory(e: Equations, memory: InputMemory, bent: Any) -> Equations:
+    """Return equations whose memory follows the input as it is bent, in place of the input."""
+    plain = casadi.vertcat(memory.u, memory.at_rest)
+    given = casadi.vertcat(*(casadi.substitute(casadi.SX(bent), e.u, value)
+                             for value in (memory.u, memory.at_rest)))  # fmt: skip
+    after, applied, start, reach = (
+        casadi.substitute(casadi.SX(value), plain, given)
+        for value in (memory.after, memory.applied, memory.start, memory.reach)
     )
-    play = dataclasses.replace(play, after=after, applied=applied, start=start)
-    return dataclasses.replace(e, play=play)
+    memory = dataclasses.replace(memory, after=after, applied=applied, start=start, reach=reach)
+    return dataclasses.replace(e, memory=memory)
+
+
+class MemoryEffect(InputEffect):
+    """Something that the input passes once per sample, of which it depends what went before."""
+
+    stage: ClassVar[int] = 6
+    in_linear_model: ClassVar[bool] = False
+
+    @classmethod
+    def is_scanned(cls) -> bool:
+        """Say no: a few widths or speeds hardly take longer than one."""
+        return False
+
+    def remember(self, memory: Any, u: Any, period: Any, at_rest: Any) -> InputMemory:
+        """Return what the input passes, as expressions of these symbols."""
+        refuse_missing_formula("MemoryEffect", "remember(self, memory, u, period, at_rest)")
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with the memory ahead of them."""
+        require_one_input(self, e)
+        if e.memory is not None:
+            raise EffectDoesNotApply(
+                f"the input of {e.name} has a memory already, and one loop takes a single "
+                "InputBacklash or InputRateLimit"
+            )
+        symbols = (casadi.SX.sym(name) for name in ("m", "u", "period", "at_rest"))
+        return dataclasses.replace(e, memory=self.remember(*symbols))
 
 
 def require_one_input(effect: AbstractEffect, e: Equations) -> None:

@@ -129,10 +129,10 @@ def make_ordinary(e: Equations, at: OperatingPoint) -> Equations:
         If there is a backlash, whose memory is no state of a continuous system, or a delay ahead
         of a plant in discrete time.
     """
-    if e.play is not None:
+    if e.memory is not None:
         raise EffectDoesNotApply(
-            "InputBacklash has a memory that is no state of a continuous system; use "
-            "loop.without_effect('InputBacklash') first"
+            "InputBacklash or InputRateLimit has a memory that is no state of a continuous system; "
+            "take it out first, as with loop.without_effect('InputBacklash')"
         )
     if e.delay is not None:
         e = _apply_pade(e, at)

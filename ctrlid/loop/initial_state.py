@@ -11,7 +11,7 @@ from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..effects.context import find_motion
 from ..physics.linearization import compute_state_matrices
-from .period_map import find_gap
+from .period_map import find_memory_range
 from .simulation import Simulator
 
 # The initial velocity is at most so many standard deviations of the measured velocity.
@@ -259,15 +259,15 @@ class _SeveralOutputs:
 
 
 def _find_memory(simulator: Simulator, part: Record) -> tuple[int, float, float] | None:
-    """Return where the state of a backlash stands, the middle of its gap at first, and its reach.
+    """Return the place of the state that an input remembers, the middle of its range and its reach.
 
-    It may lie anywhere in its gap around the first input; None without a gap.
+    That of a backlash may lie anywhere in the gap around the first input; None without a range.
     """
     loop = simulator.loop
     e, law = loop.equations(), loop.law()
-    if e.play is None:
+    if e.memory is None:
         return None
-    middle, reach = find_gap(e, float(np.ravel(part.u)[0]), e.values)
+    middle, reach = find_memory_range(e, float(np.ravel(part.u)[0]), loop.point.input, e.values)
     place = len(e.states) + (len(law.rest) if law else 0)
     return (place, middle, reach) if reach > 0 else None
 

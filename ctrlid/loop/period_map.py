@@ -126,15 +126,16 @@ def make_period_map(
     Raises
     ------
     CtrlidError
-        If an analog controller acts through a delay or a backlash, which need a sampled input.
+        If an analog controller acts through a delay, a backlash or a limited rate: these need a
+        sampled input.
     """
     e, law = loop.equations(), loop.law()
     n, nc = len(e.states), len(law.rest) if law else 0
     pieces = 1 if law else count_pieces(hold)
     late = count_delay_samples(e, loop.dt / pieces)
-    # What the input remembers: the backlash, then the inputs of the last samples.
+    # What the input remembers: its memory, then the inputs of the last samples.
     kept = 0 if e.delay is None else late + 1
-    size = n + nc + (e.play is not None) + kept
+    size = n + nc + (e.memory is not None) + kept
     # Corners of a band-limited input follow the signals that are held; else the next sample does.
     corners, m = (pieces + 1 if pieces > 1 else 1), len(e.inputs)
     straight_r = loop.analog and hold_r == "foh"
@@ -181,7 +182,7 @@ def make_period_map(
     if law is None:
         y = measure_output(t0, z, u)
     if loop.analog:
-        if kept or e.play is not None:
+        if kept or e.memory is not None:
             raise EffectDoesNotApply(
                 "a delay or a backlash acts on the samples of a digital controller, and this loop "
                 "has an analog one. In redesign a continuous model asks for an analog controller, "
@@ -199,15 +200,16 @@ def make_period_map(
         slope = casadi.Function("rate", given, [rate(0.0, z)])
         after, error = integrate(rate, z, loop.dt, substeps)
     else:
-        memory: Any = z[n + nc] if e.play is not None else None
+        memory: Any = z[n + nc] if e.memory is not None else None
+        hold = "zoh" if law else hold
+        pass_on = functools.partial(apply_memory, e, period=loop.dt / pieces, held=hold == "zoh")
         wanted = [u] if pieces == 1 else [limit_input(u_rest + value) for value in path[:-1]]
         applied = []
         for value in wanted:
-            behind, memory = apply_backlash(e, memory, value, p)
+            behind, memory = pass_on(memory, value, p)
             applied.append(behind)
         past = [z[k] for k in range(size - kept, size)]
-        hold = "zoh" if law else hold
-        ahead = apply_backlash(e, memory, limit_input(u_rest + path[-1]), p)[0]
+        ahead = pass_on(memory, limit_input(u_rest + path[-1]), p)[0]
         # The inputs from the oldest that is remembered to the one of the next sample.
         following = [*applied, ahead if hold != "zoh" else applied[-1]]
         known = [applied[0], *following]
@@ -232,9 +234,9 @@ def make_period_map(
     rest = [*at.states, *(law.rest if law else ())]
     input_at_rest = at.inputs[e.late_input]
     memory = []
-    if e.play is not None:
-        memory = [find_gap(e, at.input, e.values)[0]]
-        behind = apply_backlash(e, memory[0], at.input, e.values)[0]
+    if e.memory is not None:
+        memory = [find_memory_range(e, at.input, at.input, e.values)[0]]
+        behind = apply_memory(e, memory[0], at.input, e.values, loop.dt)[0]
         input_at_rest = float(casadi.evalf(casadi.SX(behind)))
     rest += [*memory, *([input_at_rest] * kept)]
     step = casadi.Function("step", given, [after, y, u, error])
@@ -244,25 +246,42 @@ def make_period_map(
     return PeriodMap(e.states, tuple(rest), step, slope, counts, reference)
 
 
-def apply_backlash(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
-    """Return the input behind the backlash and its next memory; without one, u and nothing."""
-    if e.play is None:
+def apply_memory(
+    e: Equations, m: Any, u: Any, p: Any, period: float, held: bool = True
+) -> tuple[Any, Any]:
+    """Return the input that acts and the next memory; without one, u and nothing.
+
+    Parameters
+    ----------
+    e : Equations
+        The plant.
+    m, u, p : expression
+        The memory, the input and the parameters.
+    period : float
+        Time from one input to the next [s].
+    held : bool, optional
+        Whether the input is held from one to the next, and does not run straight.
+    """
+    memory = e.memory
+    if memory is None:
         return u, casadi.SX(0, 1)
-    given = casadi.vertcat(e.play.m, e.play.u, e.p)
+    given = casadi.vertcat(memory.m, memory.u, memory.period, e.p)
+    acting = memory.applied if held else memory.after
     both = casadi.substitute(
-        casadi.vertcat(e.play.applied, e.play.after), given, casadi.vertcat(m, u, p)
+        casadi.vertcat(acting, memory.after), given, casadi.vertcat(m, u, period, p)
     )
     return both[0], both[1]
 
 
-def find_gap(e: Equations, u: float, p: Any) -> tuple[float, float]:
-    """Return the memory of the backlash that belongs to a resting input, and its reach from there.
+def find_memory_range(e: Equations, u: float, at_rest: float, p: Any) -> tuple[float, float]:
+    """Return the middle of where a memory may be ahead of the first input, and its reach.
 
-    Where nobody knows what went before, the memory may be anywhere within that reach.
+    Nobody knows what went before; `at_rest` is the input at the operating point.
     """
-    assert e.play is not None
-    given = casadi.vertcat(e.play.u, e.p), casadi.vertcat(u, p)
-    found = casadi.substitute(casadi.vertcat(e.play.start, e.play.reach), *given)
+    memory = e.memory
+    assert memory is not None
+    given = casadi.vertcat(memory.u, memory.at_rest, e.p), casadi.vertcat(u, at_rest, p)
+    found = casadi.substitute(casadi.vertcat(memory.start, memory.reach), *given)
     middle, reach = casadi.DM(casadi.evalf(found)).full().ravel().tolist()
     return middle, reach
 

@@ -31,16 +31,20 @@ class Lag:
 
 
 @dataclass(frozen=True, eq=False)
-class Backlash:
+class InputMemory:
     """What an input passes through once per sample before it reaches the plant, with memory.
 
-    ``(next m, applied u)`` as expressions of the memory `m`, the computed input `u` and the
-    parameters; `start` is the memory that belongs to a resting input, an expression of `u`, and
-    `reach` how far from it the memory may be where nobody knows what went before.
+    ``(next m, applied u)`` as expressions of the memory `m`, the computed input `u`, the `period`
+    from one input to the next and the parameters. The applied input is the mean over the period;
+    where the input runs straight from sample to sample, the memory itself acts at the samples.
+    Where nobody knows what went before, the memory may be as far as `reach` from `start`; these are
+    expressions of the first input and of that `at_rest`, and for both at rest the memory is there.
     """
 
     m: Any
     u: Any
+    period: Any
+    at_rest: Any
     after: Any
     applied: Any
     start: Any
@@ -73,7 +77,7 @@ def _pack_value(value: Any, found: list[Any]) -> Any:
     if isinstance(value, casadi.SX):
         found.append(value)
         return "expression", len(found) - 1
-    if isinstance(value, Lag | Backlash):
+    if isinstance(value, Lag | InputMemory):
         return type(value), [_pack_value(v, found) for v in vars(value).values()]
     if isinstance(value, tuple):
         return "tuple", [_pack_value(v, found) for v in value]
@@ -105,7 +109,7 @@ class Equations:
 
     Effects (`with_effect`) may add more: `spread` are symbols for the standard deviations of the
     states, zero in a simulation, by which a filter smooths kinks; `lags` lists states that are
-    plain first-order lags; `play` is a memory between controller and plant; `delay` an expression
+    plain first-order lags; `memory` is one between controller and plant; `delay` an expression
     of `p` for the time by which the input comes late, of several inputs that with the index
     `late_input`; `readout` what becomes of the noisy `reading`; `rest` the values at rest of states
     that were added to the plant's own.
@@ -131,7 +135,7 @@ class Equations:
     output: Any
     spread: Any = None
     lags: tuple[Lag, ...] = ()
-    play: Backlash | None = None
+    memory: InputMemory | None = None
     delay: Any = None
     late_input: int = 0
     reading: Any = None

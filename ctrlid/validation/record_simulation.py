@@ -150,7 +150,7 @@ def prepare_stretch(
         initial[fitted : fitted + len(state)] = state
         d = part.u - replayed
     time = 0.0 if start_time is None else start_time + float(record.t[samples.start] - record.start)
-    if loop.controller is not None and not follow and loop.equations().play is not None:
+    if loop.controller is not None and not follow and loop.equations().memory is not None:
         start = _follow_input(simulator, part, initial, time)
     else:
         start = find_initial_state(simulator.smooth, part, r, d, initial, fitted, time)

@@ -367,7 +367,7 @@ def carry_trajectory(
     columns = [(mine.index(s), k) for k, s in enumerate(old.e.states) if s in mine]
     # A delay keeps a known analog controller from being followed, so both plants need its states,
     # and only one that has a backlash remembers where that began.
-    if new.size - new.n == old.size - old.n and (new.e.play is None) == (old.e.play is None):
+    if new.size - new.n == old.size - old.n and (new.e.memory is None) == (old.e.memory is None):
         columns += [(new.n + k, old.n + k) for k in range(old.size - old.n)]
     result = []
     for start, theirs in ((guess.predicted, known.predicted), (guess.filtered, known.filtered),
@@ -407,7 +407,7 @@ def converge_trajectory(
                 "units, signs and the operating point, or exclude these samples with valid="
             )
         size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
-        if plant.e.play is not None:
+        if plant.e.memory is not None:
             # Where a backlash began does not move, but is part of the input that does.
             size[-1] = max(size[-1], float(np.std(data.u)))
         still = bool((np.sqrt(np.mean(change**2, axis=0)) <= CONVERGED_MOTION * size).all())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,11 +15,12 @@ import numpy as np
 from ..._base.arrays import Array
 from ...data.reconstruction import count_pieces
 from ...loop.loop import Loop
+from ...loop.period_map import find_memory_range
 from ...physics.block_evaluation import BlockEvaluation, evaluate_blocks
 from ...physics.equations import Equations
 from ...physics.integration import count_delay_samples, substitute_delay
-from .backlash import InputRange, find_input_range, find_memory
 from .filter_data import FilterData, find_rest_state
+from .input_memory import InputRange, find_input_range
 from .transition_maps import (
     PeriodPlan,
     build_maps,
@@ -87,7 +89,7 @@ class SampledPlant:
         e = self.e = loop.equations(keep=True)
         every = list(e.parameters)
         self.index = [every.index(name) for name in self.names]
-        law = loop.law() if sees and e.play is None and e.delay is None else None
+        law = loop.law() if sees and e.memory is None and e.delay is None else None
         self.law = law if law is not None and law.dt == 0.0 else None
         self.hold_r = hold_r if self.law else "zoh"
         self.sees = sees if self.law else ""
@@ -103,7 +105,7 @@ class SampledPlant:
         self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
                          tuple(self.index), self.delay_samples, self.hold_r, self.sees)  # fmt: skip
         # What the filter estimates beside those: where a backlash stood when the record began.
-        self.size = self.plan.size + (e.play is not None)
+        self.size = self.plan.size + (e.memory is not None)
         self.maps = build_maps(self.plan)
         self.initial_conditions = InitialConditions(self.plan)
 
@@ -231,8 +233,18 @@ class SampledPlant:
 
     def _list_input_ranges(self, data: FilterData, p: Array) -> InputRange:
         """Return what acts behind the backlash at each corner; shapes (corners, n, ...)."""
-        found = find_input_range(self.e, self.index, data.path.ravel(), p)
+        found = find_input_range(
+            self.e, self.index, data.path.ravel(), p, at_rest=self.loop.point.inputs[0],
+            period=self.loop.dt / self.pieces, held=self.hold == "zoh",
+        )  # fmt: skip
         return found.map(lambda values: np.array(self._list_corners(values)))
+
+    def _find_memory(self, data: FilterData, p: Array) -> tuple[float, float]:
+        """Return what the input remembers at the start, and its standard deviation."""
+        first, at_rest = float(data.path.flat[0]), self.loop.point.inputs[0]
+        middle, reach = find_memory_range(self.e, first, at_rest, p)
+        # It is anywhere in its range.
+        return middle, reach / math.sqrt(3)
 
     def _find_expected_corners(
         self, data: FilterData, p: Array, at: Trajectory
@@ -242,11 +254,11 @@ class SampledPlant:
         Those by the memory of the backlash have shape (corners, n), those by the free parameters
         (corners, n, free).
         """
-        if self.e.play is None:
+        if self.e.memory is None:
             return self._list_corners(data.path), None, None
         ranges = self._list_input_ranges(data, p)
         # Errors of a model that does not fit yet make no memory less certain than it was at first.
-        spread = np.minimum(at.spread[:, -1], find_memory(self.e, data.path.flat[0], p)[1])
+        spread = np.minimum(at.spread[:, -1], self._find_memory(data, p)[1])
         applied, by_memory, by_free = ranges.linearize(at.filtered[:, -1], spread)
         return list(applied), by_memory, by_free
 
@@ -267,7 +279,7 @@ class SampledPlant:
         still, quiet = casadi.SX.zeros(self.n), casadi.SX.zeros(self.channels)
         y, c, hp = self.maps.sensor_function(x, w, values, still)
         seen = casadi.mtimes(c, s) + casadi.horzcat(hp, casadi.SX.zeros(1, n))
-        widths = [self.channels, p] + ([] if self.e.play is None else [self.pieces + 2])
+        widths = [self.channels, p] + ([] if self.e.memory is None else [self.pieces + 2])
         stage = [x, casadi.SX.eye(n), *(casadi.SX(n, width) for width in widths)]
         carried = len(stage) if self.maps.carries else 1
         for function, part in itertools.product(self.maps.functions, range(self.maps.parts)):
@@ -286,7 +298,7 @@ class SampledPlant:
         begins in the middle of its gap.
         """
         p = self.insert_free_values(theta)
-        memory = find_memory(self.e, data.path.flat[0], p)[0] if self.e.play is not None else None
+        memory = self._find_memory(data, p)[0] if self.e.memory is not None else None
         return self._stack_known_signals(data, p, slice(None), memory)
 
     def advance(self, data: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
@@ -310,7 +322,7 @@ class SampledPlant:
 
     def _stack_known_signals(self, data: FilterData, p: Array, rows: Any, memory: Any) -> Array:
         """Return what `_stack_signals` does at some samples, the memory of a backlash known."""
-        if self.e.play is None:
+        if self.e.memory is None:
             corners = [corner[rows] for corner in self._list_corners(data.path)]
         else:
             ranges = self._list_input_ranges(data, p).map(lambda values: values[:, rows])
@@ -357,11 +369,13 @@ class SampledPlant:
         A known analog controller begins at rest, a backlash anywhere in its gap.
         """
         start, spread = (self.pad_controller_states(v) for v in (start, spread))
-        if self.e.play is None:
+        if self.e.memory is None:
             return start, spread
-        memory, deviation = find_memory(self.e, data.path.flat[0], p)
+        memory, deviation = self._find_memory(data, p)
         wide = np.pad(spread, (0, 1))
-        wide[-1, -1] = (deviation / data.scale) ** 2
+        with np.errstate(over="ignore"):
+            # Of an input that runs away the square is infinite, which the filter refuses.
+            wide[-1, -1] = np.square(deviation / data.scale)
         return np.append(start, memory), wide
 
 
@@ -403,7 +417,7 @@ class InitialConditions:
             far = np.clip(late - np.arange(len(u)), 0.0, 1.0)
             # These samples may all have been off by the same, which the filter takes for chance.
             # Beside several signals an input is counted in its standard deviations.
-            size = np.var(u) if e.siso or e.play is not None else 1.0
+            size = np.var(u) if e.siso or e.memory is not None else 1.0
             variance = variance + far**2 * max(late, 1.0) * size
         return variance
 

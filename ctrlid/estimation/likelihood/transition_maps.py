@@ -105,9 +105,9 @@ class PeriodPlan:
         given, found = [e.t, e.x, e.u, e.p, spread], [e.rhs, e.output]
         found += [part for lag in e.lags for part in (lag.time_constant, lag.target)]
         found += [part for part in (e.delay, e.pushes) if part is not None]
-        if e.play is not None:
-            given += [e.play.m, e.play.u]
-            found += [e.play.after, e.play.applied, e.play.start]
+        if e.memory is not None:
+            given += [e.memory.m, e.memory.u, e.memory.period, e.memory.at_rest]
+            found += [e.memory.after, e.memory.applied, e.memory.start, e.memory.reach]
         if law is not None:
             state, r, y = (
                 casadi.SX.sym(key, size)
@@ -275,7 +275,7 @@ def build_maps(plan: PeriodPlan) -> TransitionMaps:
     """Return the maps, built once: that takes the time of several passes."""
     x, ends, given, by, parts = _build_period(plan)
     # Behind backlash, the input itself depends on the free parameters.
-    own = ("force", "free") if plan.equations.play is None else ("force", "free", "input")
+    own = ("force", "free") if plan.equations.memory is None else ("force", "free", "input")
     functions = _chain_maps(x, ends, parts, given, [by[key] for key in own], plan.index)
     output = by["output"]
     outputs = [output, casadi.jacobian(output, x), casadi.jacobian(output, by["free"])]

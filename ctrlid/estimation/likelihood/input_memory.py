@@ -1,4 +1,4 @@
-"""The input behind a backlash of which nobody knows where it stood when a record began."""
+"""The input behind a backlash or a limited rate, of which nobody knows where it stood at first."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ from scipy import special, stats
 from ..._base.arrays import Array
 from ..._base.compilation import compile_loop
 from ..._base.interruption import keep_interrupt
-from ...loop.period_map import apply_backlash, find_gap
+from ...loop.period_map import apply_memory, find_memory_range
 from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Equations
 
 # Beyond so many standard deviations a corner is met for certain; a spread of zero is no exception.
 CERTAIN = 30.0
+# The ends of the range are met from a little beyond, where a gap clips and has derivatives.
+BEYOND = 1 + 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class InputRange:
-    r"""What the input behind a backlash may be at each sample, and its derivatives.
+    r"""What the input behind its memory may be at each sample, and its derivatives.
 
     A backlash only ever clips what it remembers, and clips one after another are a clip: from
     the memory m at the start,
@@ -31,7 +33,9 @@ class InputRange:
     .. math:: u_a = \min(\max(m, l_k), h_k)
 
     where l and h are the inputs that follow from the lowest and from the highest memory there is.
-    They are equal from the sample on at which the input has crossed the gap.
+    They are equal from the sample on at which the input has crossed the gap. Of a limited rate, l
+    and h are bounds, which are met where the actuator stands at either end when the record begins:
+    at rest, or where it is told to be.
 
     Parameters
     ----------
@@ -91,31 +95,34 @@ class InputRange:
         return applied, inside - beyond, by_parameters
 
 
-def find_memory(e: Equations, u: float, p: Array) -> tuple[float, float]:
-    """Return the memory at the start, and its standard deviation: anywhere in the gap."""
-    middle, reach = find_gap(e, u, p)
-    return middle, reach / np.sqrt(3)
-
-
-def find_input_range(e: Equations, index: Sequence[int], u: Array, p: Array) -> InputRange:
-    """Return what the input behind the backlash may be along a record.
+def find_input_range(
+    e: Equations, index: Sequence[int], u: Array, p: Array, at_rest: float, period: float,
+    held: bool,
+) -> InputRange:  # fmt: skip
+    """Return what the input behind its memory may be along a record.
 
     Parameters
     ----------
     e : Equations
-        The plant, with a backlash.
+        The plant, with a backlash or a limited rate.
     index : sequence of int
         Places of the free parameters.
     u : ndarray, shape (n,)
-        The input before the backlash.
+        The input before it.
     p : ndarray
         Values of all parameters.
+    at_rest : float
+        The input at the operating point.
+    period : float
+        Time from one input to the next [s].
+    held : bool
+        Whether the input is held from one to the next, and does not run straight.
     """
-    after, slopes = e.derive(("backlash", tuple(index)), lambda: _build_maps(e, index))
-    middle, reach = find_gap(e, float(u[0]), p)
+    key = ("input memory", tuple(index), period, held)
+    after, slopes = e.derive(key, lambda: _build_maps(e, index, period, held))
+    middle, reach = find_memory_range(e, float(u[0]), at_rest, p)
     found = []
-    # A memory outside the gap is clipped to its end, whose derivatives are those of a clip.
-    for first in (middle - 2 * reach, middle + 2 * reach):
+    for first in (middle - BEYOND * reach, middle + BEYOND * reach):
         follow = after.iterate(np.array([first]), u[None, :], p)[:, 0]
         memories = np.concatenate([[first], follow[:-1]])
         applied, *parts = slopes(memories[None, :], u[None, :], p)
@@ -126,17 +133,19 @@ def find_input_range(e: Equations, index: Sequence[int], u: Array, p: Array) -> 
     return InputRange(low, high, low_slopes, high_slopes)
 
 
-def _build_maps(e: Equations, index: Sequence[int]) -> tuple[BlockEvaluation, BlockEvaluation]:
+def _build_maps(
+    e: Equations, index: Sequence[int], period: float, held: bool
+) -> tuple[BlockEvaluation, BlockEvaluation]:
     """Return the next memory, and the applied input with the derivatives of both.
 
     Functions of memory, input and parameters; derivatives are by the memory and by the free
     parameters.
     """
     m, u, p = casadi.SX.sym("m"), casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
-    applied, after = apply_backlash(e, m, u, p)
+    applied, after = apply_memory(e, m, u, p, period, held)
     by = casadi.vertcat(m, *(p[k] for k in index))
     slopes: list[Any] = [applied, casadi.jacobian(applied, by), casadi.jacobian(after, by)]
-    one, other = (casadi.Function("backlash", [m, u, p], out) for out in ([after], slopes))
+    one, other = (casadi.Function("memory", [m, u, p], out) for out in ([after], slopes))
     return BlockEvaluation(one), BlockEvaluation(other)
 
 
