@@ -233,8 +233,10 @@ def actuate(u, k, e, at, memory, t, h, older):
         w /= math.sqrt(1 + e[SATURATION] * w * w)
     w += e[OFFSET]
     if e[RATE] < np.inf:
-        memory[2] += min(max(w - memory[2], -e[RATE] * h), e[RATE] * h)
-        w = memory[2]
+        way = min(max(w - memory[2], -e[RATE] * h), e[RATE] * h)
+        memory[2] += way
+        # The mean of the ramp over the step acts in it.
+        w = memory[2] - way * abs(way) / (2 * e[RATE] * h)
     tau = e[LAG]
     if e[CHANGING] != 0.0:
         tau = e[CHANGING] * (1.02 + math.sin(2 * math.pi * e[CHANGING_F] * t))

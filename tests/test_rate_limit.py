@@ -12,6 +12,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.estimation.likelihood.input_memory import find_input_range
 from ctrlid.loop.simulation import Simulator
 from problems import levitation
 
@@ -134,6 +135,33 @@ def test_a_straight_input_is_followed_from_sample_to_sample(hold):
     assert np.ptp(slow[0]) < 0.8 * np.ptp(free[0])
     # The filter follows the input as the simulation does.
     assert np.abs(slow[1].innovations[10:]).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("first", "periods"),
+    [(0.0, [0.5, 1.5, 2.5, 3.5]), (5.0, [0.0, -0.5, -1.5, -2.5])],
+    ids=["at rest", "where it is told to be"],
+)
+def test_the_start_of_a_record_is_exact_where_the_actuator_rests_or_has_arrived(first, periods):
+    rate, n = 8.0, 60
+    rng = np.random.default_rng(4)
+    u = np.concatenate([[5.0], np.repeat(rng.uniform(-1, 1, n // 5), 5)[1:]])
+    e = make_loop((E.InputRateLimit(rate),)).equations(keep=True)
+    index = [list(e.parameters).index("InputRateLimit.rate")]
+    ranges = find_input_range(e, index, u, e.values, at_rest=0.0, period=DT, held=True)
+    arm, means = first, []
+    for value in u:
+        way = min(max(value - arm, -rate * DT), rate * DT)
+        means.append(arm + way - way * abs(way) / (2 * rate * DT))
+        arm += way
+    np.testing.assert_allclose(ranges.follow(np.array(first)), means, atol=1e-4)
+    memory, certain = np.full(n, first), np.zeros(n)
+    applied, by_memory, by_rate = ranges.linearize(memory, certain)
+    np.testing.assert_allclose(applied, means, atol=1e-4)
+    # A larger speed takes the arm further for as long as it has moved.
+    np.testing.assert_allclose(by_rate[:4, 0], DT * np.array(periods), atol=1e-6)
+    # The whole way of 5 is the same at both ends, until one of them has arrived.
+    assert by_memory[0] == pytest.approx((5.0 - rate * DT / 2) / 5.0, rel=1e-4)
 
 
 def test_a_speed_of_zero_moves_nothing_and_an_infinite_one_changes_nothing():

@@ -255,7 +255,9 @@ class InputRateLimit(MemoryEffect):
         lost = step * casadi.fabs(step) / (2 * most + np.finfo(float).tiny)
         start, reach = (u + at_rest) / 2, casadi.fabs(u - at_rest) / 2
         after = memory + step
-        return InputMemory(memory, u, period, at_rest, after, after - lost, start, reach)
+        return InputMemory(
+            memory, u, period, at_rest, after, after - lost, start, reach, moves=True
+        )
 
 
 def _find_rates(u: Any, dt: float) -> list[float]:

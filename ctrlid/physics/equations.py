@@ -39,6 +39,7 @@ class InputMemory:
     where the input runs straight from sample to sample, the memory itself acts at the samples.
     Where nobody knows what went before, the memory may be as far as `reach` from `start`; these are
     expressions of the first input and of that `at_rest`, and for both at rest the memory is there.
+    `moves` says that the memory goes towards the input by itself, and is not only held and carried.
     """
 
     m: Any
@@ -49,6 +50,7 @@ class InputMemory:
     applied: Any
     start: Any
     reach: Any
+    moves: bool = False
 
 
 class Formulas:

@@ -33,9 +33,14 @@ class InputRange:
     .. math:: u_a = \min(\max(m, l_k), h_k)
 
     where l and h are the inputs that follow from the lowest and from the highest memory there is.
-    They are equal from the sample on at which the input has crossed the gap. Of a limited rate, l
-    and h are bounds, which are met where the actuator stands at either end when the record begins:
-    at rest, or where it is told to be.
+    They are equal from the sample on at which the input has crossed the gap.
+
+    An actuator of limited rate moves on from where it was at the start. Until it arrives,
+
+    .. math:: u_a = l_k + \lambda (h_k - l_k), \quad \lambda = \frac{m - l}{h - l}
+
+    with the lowest and the highest memory l and h ahead of the first sample, which is exact at both
+    ends: where the actuator rests, and where it is told to be.
 
     Parameters
     ----------
@@ -43,21 +48,32 @@ class InputRange:
         The lowest and the highest input.
     low_slopes, high_slopes : ndarray, shape (..., n, free)
         Their derivatives by the free parameters.
+    ends : tuple of 2 float, optional
+        The lowest and the highest memory of an actuator that moves by itself.
     """
 
     low: Array
     high: Array
     low_slopes: Array
     high_slopes: Array
+    ends: tuple[float, float] | None = None
 
     def map(self, change: Callable[[Array], Array]) -> InputRange:
         """Return what becomes of all four by the same change, of their samples, say."""
-        parts = self.low, self.high, self.low_slopes, self.high_slopes
-        return InputRange(*(change(part) for part in parts))
+        low, high = change(self.low), change(self.high)
+        return InputRange(low, high, change(self.low_slopes), change(self.high_slopes), self.ends)
 
-    def clip(self, memory: Array) -> Array:
+    def follow(self, memory: Any) -> Array:
         """Return the input that follows from a known memory at the start."""
-        return np.asarray(np.clip(memory, self.low, self.high))
+        if self.ends is None:
+            return np.asarray(np.clip(memory, self.low, self.high))
+        return np.asarray(self.low + self._find_share(memory) * (self.high - self.low))
+
+    def _find_share(self, memory: Any) -> Any:
+        """Return where a memory is from the lowest to the highest there is, from 0 to 1."""
+        assert self.ends is not None
+        low, high = self.ends
+        return (memory - low) / (high - low) if high > low else 0.0 * memory
 
     def linearize(self, memory: Array, spread: Array) -> tuple[Array, Array, Array]:
         r"""Return the expected input and its derivatives, for a normal memory at the start.
@@ -80,6 +96,14 @@ class InputRange:
         by_parameters : ndarray, shape (..., n, free)
             Its derivatives by the free parameters.
         """
+        if self.ends is not None:
+            share, between = self._find_share(memory), self.high - self.low
+            width = self.ends[1] - self.ends[0]
+            by_parameters = (
+                self.low_slopes
+                + np.asarray(share)[..., None] * (self.high_slopes - self.low_slopes)
+            )  # fmt: skip
+            return self.follow(memory), between / width if width else 0.0 * between, by_parameters
         s = np.maximum(spread, np.finfo(float).tiny)
         with np.errstate(over="ignore"):
             above_low, above_high = (
@@ -121,8 +145,9 @@ def find_input_range(
     key = ("input memory", tuple(index), period, held)
     after, slopes = e.derive(key, lambda: _build_maps(e, index, period, held))
     middle, reach = find_memory_range(e, float(u[0]), at_rest, p)
+    ends = middle - BEYOND * reach, middle + BEYOND * reach
     found = []
-    for first in (middle - BEYOND * reach, middle + BEYOND * reach):
+    for first in ends:
         follow = after.iterate(np.array([first]), u[None, :], p)[:, 0]
         memories = np.concatenate([[first], follow[:-1]])
         applied, *parts = slopes(memories[None, :], u[None, :], p)
@@ -130,7 +155,8 @@ def find_input_range(
         by_memory = _carry_sensitivity(carried[:, 0], carried[:, 1:])
         found.append((applied[:, 0, 0], seen[:, :1] * by_memory + seen[:, 1:]))
     (low, low_slopes), (high, high_slopes) = found
-    return InputRange(low, high, low_slopes, high_slopes)
+    assert e.memory is not None
+    return InputRange(low, high, low_slopes, high_slopes, ends if e.memory.moves else None)
 
 
 def _build_maps(

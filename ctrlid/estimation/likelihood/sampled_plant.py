@@ -326,7 +326,7 @@ class SampledPlant:
             corners = [corner[rows] for corner in self._list_corners(data.path)]
         else:
             ranges = self._list_input_ranges(data, p).map(lambda values: values[:, rows])
-            corners = list(ranges.clip(memory))
+            corners = list(ranges.follow(memory))
         return self._stack_signals(data, corners, rows)
 
     def _stack_signals(
