@@ -18,17 +18,21 @@ from ctrlid.diagnosis.fresh_data import choose_fresh_data
 from ctrlid.diagnosis.gap import compute_chance_among_runs, measure_noise_errors
 from ctrlid.diagnosis.gap_summary import make_noise_test
 from ctrlid.diagnosis.noise_choice import rings_at_line
+from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.estimation.likelihood.kalman_filter import Noise, compute_memory
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_noise, maximize
-from ctrlid.estimation.likelihood.noise.coordinates import RINGING
+from ctrlid.estimation.likelihood.noise.coordinates import RINGING, compute_noise_criterion
 from ctrlid.estimation.likelihood.noise.fit import fit_noise
+from ctrlid.estimation.likelihood.noise.orders import try_coloured_force
 from problems import diagnose_draw, load_script
 
 
-def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02, dead_zone=0.0):
+def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02, dead_zone=0.0, force=None):
     """Return reading and input of y" = 3 u - 2 y' with a PD that sees the noise, held exactly.
+
+    A random `force` is an acceleration that is held over each period.
 
     The transition is a matrix exponential: what interpolates the input between samples, as
     scipy.signal.lsim does unless told otherwise, is another plant, with a large random force.
@@ -43,7 +47,8 @@ def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02, dead_zo
         d = (filter_time * d + kd * (e - last)) / (filter_time + dt)
         u[k], last = kp * e + d, e
         acting = u[k] - np.clip(u[k], -dead_zone, dead_zone)
-        x = move[:2, :2] @ x + move[:2, 2] * acting
+        push = 0.0 if force is None else force[k] / 3.0
+        x = move[:2, :2] @ x + move[:2, 2] * (acting + push)
     return y, u
 
 
@@ -101,6 +106,30 @@ def test_the_order_of_coloured_noise_is_found_and_white_stays_white(b, a, orders
     assert abs(np.mean(z[1:] * z[:-1])) < 4 / np.sqrt(len(z))
     error = (fit.theta - [3.0, 2.0]) / fit.standard_errors
     assert np.abs(error).max() < 4
+
+
+def test_a_coloured_force_and_a_colour_of_the_sensor_are_found_beside_each_other():
+    """Gusts on a plant whose sensor errs alike in successive readings."""
+    loop, record, noise = make_loop_and_record([1.0], [1.0, -0.5], n=3000, seed=9)
+    rng = np.random.default_rng(10)
+    keep, size = np.exp(-0.01 / 0.5), 0.3
+    force = signal.lfilter([size * np.sqrt(1 - keep**2)], [1.0, -keep], rng.standard_normal(3500))
+    y, u = simulate_servo(record.r, noise, force=force[500:])
+    record = dataclasses.replace(record, y=y, u=u)
+    fit = maximize(begin_fit(make_problem(loop, ("k", "c"), [record])))
+    gusts = maximize(try_coloured_force(fit))
+    both = choose_sensor_noise(gusts)
+    assert both.noise.drift
+    assert not both.noise.sensor_is_white
+    assert compute_noise_criterion(both) > compute_noise_criterion(gusts) + 30
+    assert both.noise.ar[0] == pytest.approx(0.5, abs=0.12)
+    assert -0.01 / np.log(both.noise.memory) == pytest.approx(0.5, rel=0.5)
+    assert np.sqrt(both.noise.coloured * both.sensor[0]) == pytest.approx(size, rel=0.3)
+    assert run_noise_tests(both).passed
+    # Without gusts there are none beside the colour.
+    loop, record, _ = make_loop_and_record([1.0], [1.0, -0.5], n=1500)
+    still = maximize(begin_fit(make_problem(loop, ("k", "c"), [record])))
+    assert not choose_sensor_noise(maximize(try_coloured_force(still))).noise.drift
 
 
 @functools.cache

@@ -361,14 +361,18 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
 
 
 def choose_sensor_noise(fit: Fit) -> Fit:
-    """Return the fit with coloured sensor noise if the BIC wants it, in place of a coloured force.
+    """Return the fit with coloured sensor noise if the BIC wants it.
 
-    Both explain much of the same, so the likelihood decides between them.
+    It takes the place of a coloured force, or stands beside it. Both explain much of the same, so
+    the likelihood decides.
     """
     if fit.known is not None:
         return fit
     richer, promised = _colour_sensor(fit)
     least = compute_noise_criterion(fit)
+    if fit.noise.drift:
+        both, _ = _colour_sensor(fit, beside=True)
+        richer = max(richer, both, key=compute_noise_criterion)
     if not compute_noise_criterion(richer) > least and promised > least and fit.noise.drift:
         # A coloured force that stood for the colour may have led a parameter so far astray that the
         # climb beside the colour loses the record.
@@ -379,20 +383,23 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     # there for wrong parameters needs fewer coefficients now, or as many others.
     count = len(richer.noise.ar) + len(richer.noise.ma)
     for most in range(max(count - 1, 1), count + 1):
-        anew = try_coloured_sensor(richer, most)
+        anew = try_coloured_sensor(richer, most, beside=bool(richer.noise.drift))
         if compute_noise_criterion(anew) > compute_noise_criterion(richer) + OTHER_NOISE_GAIN:
             return maximize(anew)
     return richer
 
 
-def _colour_sensor(fit: Fit) -> tuple[Fit, float]:
-    """Return the fit with coloured sensor noise, and the criterion that it had at the start."""
-    start = try_coloured_sensor(fit)
+def _colour_sensor(fit: Fit, beside: bool = False) -> tuple[Fit, float]:
+    """Return the fit with coloured sensor noise, and the criterion that it had at the start.
+
+    A coloured force may stay `beside` it.
+    """
+    start = try_coloured_sensor(fit, beside=beside)
     richer = maximize(start)
     # A force that stood for the colour may have led a parameter astray, which needs it there.
     quiet = maximize(replace(richer, noise=quieten_force(richer.noise)), exact=False)
     if quiet.value > richer.value + OTHER_NOISE_GAIN:
-        anew = try_coloured_sensor(relinearize_fit(quiet))
+        anew = try_coloured_sensor(relinearize_fit(quiet), beside=beside)
         richer = maximize(max(quiet, anew, key=compute_noise_criterion))
     return richer, compute_noise_criterion(start)
 

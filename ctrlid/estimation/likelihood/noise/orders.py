@@ -78,8 +78,8 @@ def _find_likeliest(fit: Fit, noises: Sequence[Noise]) -> tuple[Noise, float]:
     return noises[k], values[k]
 
 
-def try_coloured_sensor(fit: Fit, most: int = sum(ORDERS)) -> Fit:
-    """Return the fit with the coloured sensor noise that the BIC prefers, no coloured force beside.
+def try_coloured_sensor(fit: Fit, most: int = sum(ORDERS), beside: bool = False) -> Fit:
+    """Return the fit with the coloured sensor noise that the BIC prefers.
 
     Parameters of the plant stay as they are. From the first order on, a coefficient more is tried
     on either side until none pays. A random walk beside white noise, which hardly shows in any
@@ -91,17 +91,20 @@ def try_coloured_sensor(fit: Fit, most: int = sum(ORDERS)) -> Fit:
         The fit.
     most : int, optional
         Number of coefficients at most, one or more.
+    beside : bool, optional
+        Whether a coloured force stays beside it, and no random walk of the sensor, which moves as
+        slowly, is tried. By default the colour of the sensor takes its place.
 
     References
     ----------
     Hannan and Rissanen, Biometrika 69 (1982) 81-94, for the choice of orders by a criterion.
     """
-    forces = _list_smaller_forces(fit)
-    tails = fit.noise.tails
+    white = replace(fit.noise if beside else fit.noise.plain, ar=(), ma=())
+    quieter = [replace(white, force=force) for force in _list_smaller_forces(fit)]
     values: list[tuple[float, ...]] = [(v,) for v in SIZES]
 
     def fit_moving(starts: Sequence[tuple[float, ...]]) -> Fit:
-        return _fit_best(fit, [Noise(f, ma=ma, tails=tails) for f in forces for ma in starts])
+        return _fit_best(fit, [replace(noise, ma=ma) for noise in quieter for ma in starts])
 
     # A converter that averages samples has zeros on the unit circle, all of which it needs at once,
     # and which a search from within nears ever more slowly.
@@ -109,11 +112,11 @@ def try_coloured_sensor(fit: Fit, most: int = sum(ORDERS)) -> Fit:
     averages = [[*values, (1.0,)]]
     averages += [[(AVERAGED,) * q, (1.0,) * q] for q in range(2, min(ORDERS[1], most) + 1)]
     chains = [
-        _fit_best(fit, [Noise(f, ar=ar, tails=tails) for f in forces for ar in values]),
+        _fit_best(fit, [replace(noise, ar=ar) for noise in quieter for ar in values]),
         max((fit_moving(each) for each in averages), key=compute_noise_criterion),
     ]
-    if most > 1:
-        chains.append(_fit_best(fit, list(_list_walks(fit, forces))))
+    if most > 1 and not beside:
+        chains.append(_fit_best(fit, list(_list_walks(fit, _list_smaller_forces(fit)))))
     reached: dict[tuple[int, int], float] = {}
     return max((_lengthen_sensor_noise(f, most, reached) for f in chains),
                key=compute_noise_criterion)  # fmt: skip
