@@ -130,6 +130,33 @@ def test_what_no_record_tells_apart_is_one_name():
     assert join_names([scale]) == "ConstantForce, SensorGain or the parameter g of the plant"
 
 
+def test_a_line_is_not_blamed_on_the_sensor_alone_where_no_mass_moves():
+    """The tension of a web behind a roll that runs out of true, which no effect of it can name."""
+    k, tau, dt, n, line = 2.0, 0.5, 0.05, 800, 0.9
+    rng = np.random.default_rng(3)
+    r = np.repeat(rng.choice([9.0, 11.0], n // 40), 40)
+    y, u, tension, integral = np.zeros(n), np.zeros(n), 10.0, 10.0 / k
+    for i in range(n):
+        y[i] = tension + 0.02 * rng.standard_normal()
+        integral += 0.1 * (r[i] - y[i]) * dt
+        u[i] = 0.3 * (r[i] - y[i]) + integral
+        for j in range(20):
+            t = (i + j / 20) * dt
+            push = 0.5 * np.sin(2 * np.pi * line * t)
+            tension += dt / 20 * ((k * u[i] - tension) / tau + push)
+    plant = ct.nlsys(lambda t, x, u, q: (q["k"] * u - x) / q["tau"], lambda t, x, u, q: x,
+                     inputs=["u"], outputs=["T"], states=["T"], params={"k": k, "tau": tau},
+                     name="web")  # fmt: skip
+    at = cid.OperatingPoint((10.0,), 10.0 / k, 10.0)
+    loop = cid.Loop(plant, None, dt=dt, at=at, free={"k": 0.05, "tau": 0.05})
+    found = cid.diagnose(loop, cid.Record(r=r, u=u, y=y, dt=dt), progress=False,
+                         catalogue=(E.SensorHum, E.SensorLag))  # fmt: skip
+    assert found.findings[0].names == ("SensorHum",)
+    assert found.findings[0].effect.frequency == pytest.approx(line, rel=0.01)
+    assert "a disturbance of the plant itself at this frequency" in " ".join(str(found).split())
+    assert E.SensorHum(0.1, 1.0).disguise(levitated().equations()) is None
+
+
 def test_a_step_stays_within_the_record_and_a_parameter_keeps_its_sign():
     class Seen:
         dt, duration, travel, fastest = DT, 4.0, 1.0, 1.0

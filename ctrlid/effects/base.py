@@ -148,6 +148,17 @@ class AbstractEffect(metaclass=CheckedCalls):
         del dt
         return None
 
+    def disguise(self, e: Equations) -> str | None:
+        """Say what has no name in the catalogue and reads alike on a plant; by default None.
+
+        Parameters
+        ----------
+        e : Equations
+            The plant.
+        """
+        del e
+        return None
+
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Return what a record limits parameters to, beyond their own bounds; nothing by default.
 

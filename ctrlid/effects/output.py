@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self, final
 import numpy as np
 
 from .._base.errors import EffectDoesNotApply
+from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint, compute_state_matrices
 from ..physics.symbols import Symbol
 from .context import Moment
@@ -298,6 +299,15 @@ class SensorHum(OutputEffect):
         The reading is sampled as it is, while the mass that a force moves averages over a period.
         """
         return {"frequency": (1.0 / seen.duration, 0.5 / seen.dt)}
+
+    def disguise(self, e: Equations) -> str | None:
+        """Say that a plant without a moving mass may be disturbed at the frequency."""
+        if e.velocities:
+            return None
+        return (
+            "a disturbance of the plant itself at this frequency, such as a roll that runs out of "
+            "true, reads alike, and has no name in the catalogue where no mass moves"
+        )
 
     def scan(self, sight: Sight) -> Scan:
         """Look at the strongest line of the prediction errors."""
