@@ -29,6 +29,20 @@ def test_what_is_hidden_by_something_like_it_is_found(draw):
     assert found.verdict == "explained"
 
 
+@pytest.mark.slow
+def test_what_can_only_stand_in_is_no_rival_of_a_colour():
+    """A curve of the input beside the law of force, which a colour of the sensor leaves its turn.
+
+    It gains a small share of what is missing as long as the colour is, and the search ended there.
+    """
+    some = E.ForceExponent, E.InputNonlinearity, E.InputSaturatingGain, E.LinearStiffness
+    case, found = diagnose_draw("two", 93060, some)
+    assert {*case.hidden} == {"InputSaturatingGain", "ForceExponent"}
+    named = [set(f.names) for f in found.findings]
+    assert len(named) == 2
+    assert all(any(name in each for each in named) for name in case.hidden)
+
+
 def test_a_size_is_borrowed_in_its_unit_alone():
     loop = levitation()
     record = record_of(loop, swing=1e-4, hold=40, n=400, seed=1, sensor_noise=2e-6)

@@ -118,7 +118,7 @@ def test_a_coloured_force_and_a_colour_of_the_sensor_are_found_beside_each_other
     record = dataclasses.replace(record, y=y, u=u)
     fit = maximize(begin_fit(make_problem(loop, ("k", "c"), [record])))
     gusts = maximize(try_coloured_force(fit))
-    both = choose_sensor_noise(gusts)
+    both = choose_sensor_noise(gusts, beside=True)
     assert both.noise.drift
     assert not both.noise.sensor_is_white
     assert compute_noise_criterion(both) > compute_noise_criterion(gusts) + 30
@@ -129,7 +129,8 @@ def test_a_coloured_force_and_a_colour_of_the_sensor_are_found_beside_each_other
     # Without gusts there are none beside the colour.
     loop, record, _ = make_loop_and_record([1.0], [1.0, -0.5], n=1500)
     still = maximize(begin_fit(make_problem(loop, ("k", "c"), [record])))
-    assert not choose_sensor_noise(maximize(try_coloured_force(still))).noise.drift
+    stirred = maximize(try_coloured_force(still))
+    assert not choose_sensor_noise(stirred, beside=True).noise.drift
 
 
 @functools.cache

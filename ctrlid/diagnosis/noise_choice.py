@@ -47,8 +47,9 @@ def prefer_sensor_noise(
         parameters = count_noise_parameters(best.model.fit) - count_noise_parameters(fit)
         earned = best.net_gain - bayesian_penalty(parameters, fit.size)
         more = max(0.0, earned - THRESHOLD.gate)
-    tried = []
-    tried += _try_colour(fit, more)
+    # Where an effect is worth its name, two colours at once would explain it away.
+    alone = best is None or best.net_gain <= THRESHOLD.gate
+    tried = _try_colour(fit, more, beside=alone)
     if fit.noise.tails is None and tests.has_heavy_tails:
         heavy = choose_tails(fit)
         if not _errs_less_than_rounding(heavy):
@@ -83,12 +84,15 @@ def measure_colour_gain(model: Model, more: float) -> float:
     return max((compute_noise_criterion(f) - before for f in _try_colour(fit, more)), default=0.0)
 
 
-def _try_colour(fit: Fit, more: float) -> list[Fit]:
-    """Return the fit with coloured sensor noise, if that may gain so much."""
+def _try_colour(fit: Fit, more: float, beside: bool = False) -> list[Fit]:
+    """Return the fit with coloured sensor noise, if that may gain so much.
+
+    It may stand `beside` a coloured force or takes its place.
+    """
     # Of several outputs no colour is fitted.
     if fit.plant.e.siso and fit.noise.sensor_is_white and _may_be_coloured(fit, more):
         with contextlib.suppress(ModelCannotRun):
-            return [choose_sensor_noise(fit)]
+            return [choose_sensor_noise(fit, beside)]
     return []
 
 

@@ -360,17 +360,17 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
     return richer if always or richer.value > fit.value + bayesian_penalty(2, fit.size) else fit
 
 
-def choose_sensor_noise(fit: Fit) -> Fit:
-    """Return the fit with coloured sensor noise if the BIC wants it.
+def choose_sensor_noise(fit: Fit, beside: bool = False) -> Fit:
+    """Return the fit with coloured sensor noise if the BIC wants it, in place of a coloured force.
 
-    It takes the place of a coloured force, or stands beside it. Both explain much of the same, so
-    the likelihood decides.
+    Both explain much of the same, so the likelihood decides between them. It may also stand
+    `beside` the force: together they explain nearly everything, a missing effect as well.
     """
     if fit.known is not None:
         return fit
     richer, promised = _colour_sensor(fit)
     least = compute_noise_criterion(fit)
-    if fit.noise.drift:
+    if beside and fit.noise.drift:
         both, _ = _colour_sensor(fit, beside=True)
         richer = max(richer, both, key=compute_noise_criterion)
     if not compute_noise_criterion(richer) > least and promised > least and fit.noise.drift:
