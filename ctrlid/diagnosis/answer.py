@@ -258,7 +258,9 @@ def _make_finding(
     if apart:
         words, reference = find_experiment(f.trial, apart, records[0])
     seen = _find_presence(f, found, records)
-    note = "" if seen is None else describe_presence(seen, len(records))
+    notes = [None if seen is None else describe_presence(seen, len(records)),
+             effect.disguise(loop.equations())]  # fmt: skip
+    note = "; ".join(words for words in notes if words is not None)
     return Finding(effect, own, others, same, f.trial.gain, shares.get(f.position, math.nan),
                    words, reference, note, tuple(k + 1 for k in seen or ()),
                    effect.units(loop))  # fmt: skip

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -161,24 +162,16 @@ def _grow_model(
         given_values = None if steps else restore_given_values(base)
         step = run_round(model, pool, work, given_values, given, beside=bool(steps))
         # Noise may be coloured and have heavy tails, one after the other.
-        while True:
-            other = prefer_sensor_noise(model, step.best, is_false)
-            if (
-                other is None
-                and step.best is not None
-                and _is_stand_in(step.best, model, beside=bool(steps))
-            ):
-                # What can only stand in for what is missing is no rival of a colour either.
-                step = replace(step, best=None)
-                other = prefer_sensor_noise(model, None, is_false)
-            if other is None:
-                break
+        is_stand_in = partial(_is_stand_in, beside=bool(steps))
+        while (other := prefer_sensor_noise(model, step.best, is_false, is_stand_in)) is not None:
             tell(f"{head}: screening beside other sensor noise")
             model, base = other, base if steps else other
             reached.model, reached.base = model, base
             pool = list_missing_candidates(model, catalogue)
             step = run_round(model, pool, work, given=given, beside=bool(steps))
         step = replace(step, base=Model(model.loop, drop_linearization(model.fit)))
+        if step.best is not None and is_stand_in(step.best, model):
+            step = replace(step, best=None)
         asked = steps and not first and not changed
         tell(f"{head}: checking", ranked=False)
         better = find_better_choice(steps[-1], step, catalogue, work) if asked else None

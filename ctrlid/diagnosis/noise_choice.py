@@ -27,8 +27,9 @@ from .thresholds import THRESHOLD
 
 
 def prefer_sensor_noise(
-    model: Model, best: Trial | None, is_false: Callable[..., bool]
-) -> Model | None:
+    model: Model, best: Trial | None, is_false: Callable[..., bool],
+    is_stand_in: Callable[[Trial, Model], bool],
+) -> Model | None:  # fmt: skip
     """Return the model with other sensor noise if that gains about as much as the best effect.
 
     Coloured, or with heavy tails. An effect has to gain more than the noise by as much as it has to
@@ -47,9 +48,7 @@ def prefer_sensor_noise(
         parameters = count_noise_parameters(best.model.fit) - count_noise_parameters(fit)
         earned = best.net_gain - bayesian_penalty(parameters, fit.size)
         more = max(0.0, earned - THRESHOLD.gate)
-    # Where an effect is worth its name, two colours at once would explain it away.
-    alone = best is None or best.net_gain <= THRESHOLD.gate
-    tried = _try_colour(fit, more, beside=alone)
+    tried = _try_colour(fit, more)
     if fit.noise.tails is None and tests.has_heavy_tails:
         heavy = choose_tails(fit)
         if not _errs_less_than_rounding(heavy):
@@ -62,14 +61,33 @@ def prefer_sensor_noise(
     recoloured = with_linearization(Model(model.loop, other))
     if newly_coloured and is_false(recoloured, model):
         return None
-    if (
-        newly_coloured
-        and best is not None
-        and (_takes_line(other, best, model) or _gains_beside_colour(other, best))
-    ):
-        # The line or the effect is taken first, and the colour is chosen anew beside it.
-        return None
+    if newly_coloured and best is not None:
+        # The line or the effect is taken first, and the colour is chosen anew beside it. What can
+        # only stand in for what is missing has no such turn.
+        if _takes_line(other, best, model):
+            return None
+        if _gains_beside_colour(other, best) and not is_stand_in(best, model):
+            return None
     return recoloured
+
+
+def colour_beside_force(model: Model, is_false: Callable[..., bool]) -> Model | None:
+    """Return a model with coloured sensor noise beside its coloured force, if the BIC wants it.
+
+    Two colours at once explain nearly everything, a missing effect as well, so that this is for a
+    model to which no effect was found.
+    """
+    model = with_linearization(model)
+    fit = model.fit
+    if not (fit.noise.drift and fit.noise.sensor_is_white and _is_open_to_other_noise(fit)):
+        return None
+    if not measure_colour_promise(fit) > bayesian_penalty(1, fit.size):
+        return None
+    with contextlib.suppress(ModelCannotRun):
+        both = with_linearization(Model(model.loop, choose_sensor_noise(fit, beside=True)))
+        if not both.fit.noise.sensor_is_white and not is_false(both, model):
+            return both
+    return None
 
 
 def measure_colour_gain(model: Model, more: float) -> float:
@@ -84,15 +102,12 @@ def measure_colour_gain(model: Model, more: float) -> float:
     return max((compute_noise_criterion(f) - before for f in _try_colour(fit, more)), default=0.0)
 
 
-def _try_colour(fit: Fit, more: float, beside: bool = False) -> list[Fit]:
-    """Return the fit with coloured sensor noise, if that may gain so much.
-
-    It may stand `beside` a coloured force or takes its place.
-    """
+def _try_colour(fit: Fit, more: float) -> list[Fit]:
+    """Return the fit with coloured sensor noise, if that may gain so much."""
     # Of several outputs no colour is fitted.
     if fit.plant.e.siso and fit.noise.sensor_is_white and _may_be_coloured(fit, more):
         with contextlib.suppress(ModelCannotRun):
-            return [choose_sensor_noise(fit, beside)]
+            return [choose_sensor_noise(fit)]
     return []
 
 

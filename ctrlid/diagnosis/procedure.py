@@ -46,6 +46,7 @@ from .growth import (
     search_effects,
 )
 from .log_errors import Log, find_log_error, seems_idle
+from .noise_choice import colour_beside_force
 from .open_loop_search import search_by_simulation
 from .progress import Progress
 from .recalibration import recalibrate
@@ -272,13 +273,16 @@ def diagnose(
                    seconds=time.monotonic() - started)  # fmt: skip
 
 
-def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
-    """Take the steps of the theory page, for records that are diagnosed together."""
+def _answer_question(q: Question, start: Model | None = None) -> tuple[Diagnosis, Search]:
+    """Take the steps of the theory page, for records that are diagnosed together.
+
+    A recalibrated model to `start` from may be given.
+    """
     # Step 1: what the readout of the sensor shows by itself is no candidate.
     readout = read_limits(q.loop, q.records, q.audits, q.catalogue)
     # Step 2: a wrong value of a parameter is no missing effect.
     q.tell("recalibrating")
-    base = sharpen_model(recalibrate(readout.loop, readout.records, q.audits))
+    base = start or sharpen_model(recalibrate(readout.loop, readout.records, q.audits))
     stepped = _add_steps(q, base)
     if stepped is not None:
         return _answer_question(stepped)
@@ -347,6 +351,12 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     q = replace(q, fresh=fresh)
     if len(q.records) == 1 and search.finished:
         search, summary = take_back_widening(q.loop, search, summary, q.fresh)
+    if search.finished and not search.found and not search.after.passed:
+        # Gusts and a sensor that errs alike may be all there is, or have hidden what is missing.
+        other = q.attempt(lambda: colour_beside_force(search.final, is_false), None)
+        if other is not None:
+            q.tell("beginning anew beside other noise")
+            return _answer_question(q, other)
     # Step 10: the decision table.
     q.tell("writing the report")
     # What was not compared was not asked either whether it only stands in for something.

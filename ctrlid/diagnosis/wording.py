@@ -482,9 +482,6 @@ def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
             f"no record of u and y can distinguish it from {write_list(same)}, because on this "
             "plant their influence is the same"
         )
-    unnamed = finding.effect.disguise(found.loop.equations())
-    if unnamed is not None:
-        lines.append(unnamed)
     frequency = finding.effect.values().get("frequency")
     if frequency is not None and finding.effect.repeatable:
         error = finding.standard_errors.get("frequency", 0.0)
