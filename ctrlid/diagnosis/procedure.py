@@ -351,12 +351,6 @@ def _answer_question(q: Question, start: Model | None = None) -> tuple[Diagnosis
     q = replace(q, fresh=fresh)
     if len(q.records) == 1 and search.finished:
         search, summary = take_back_widening(q.loop, search, summary, q.fresh)
-    if search.finished and not search.found and not search.after.passed:
-        # Gusts and a sensor that errs alike may be all there is, or have hidden what is missing.
-        other = q.attempt(lambda: colour_beside_force(search.final, is_false), None)
-        if other is not None:
-            q.tell("beginning anew beside other noise")
-            return _answer_question(q, other)
     # Step 10: the decision table.
     q.tell("writing the report")
     # What was not compared was not asked either whether it only stands in for something.
@@ -365,8 +359,17 @@ def _answer_question(q: Question, start: Model | None = None) -> tuple[Diagnosis
     result = assemble_answer(q.loop, q.records, search, summary, read)
     result = replace(result, notes=(*result.notes, *notes))
     if search.finished and _is_worth_simulating(q, result, summary.gap, base.records):
-        other = q.attempt(lambda: _answer_by_simulation(q, search, summary.gap, read), None)
-        return other or (result, search)
+        simulated: tuple[Diagnosis, Search] | None
+        simulated = q.attempt(lambda: _answer_by_simulation(q, search, summary.gap, read), None)
+        if simulated is not None:
+            return simulated
+    if search.finished and not search.found and not search.after.passed:
+        # Gusts and a sensor that errs alike may be all there is, or have hidden what is missing.
+        coloured = q.attempt(lambda: colour_beside_force(search.final, is_false), None)
+        if coloured is not None:
+            q.tell("beginning anew beside other noise")
+            anew = _answer_question(q, coloured)
+            return anew if anew[1].finished else (result, search)
     return result, search
 
 
