@@ -184,12 +184,13 @@ def make_period_map(
     if loop.analog:
         if kept or e.memory is not None:
             raise EffectDoesNotApply(
-                "a delay or a backlash acts on the samples of a digital controller, and this loop "
-                "has an analog one. In redesign a continuous model asks for an analog controller, "
-                "also where that of the loop is digital: sample the model first, with the period "
-                f"of the loop, ct.sample_system(G, {loop.dt:g}), where G is loop.linearize() or "
-                "the model you gave. Otherwise give the loop a digital controller, or put the "
-                "delay into the plant as a Padé approximation (control.pade)"
+                "a delay, a backlash or a limited rate acts on the samples of a digital "
+                "controller, and this loop has an analog one. In redesign a continuous model asks "
+                "for an analog controller, also where that of the loop is digital: sample the "
+                "model first, with the period of the loop, "
+                f"ct.sample_system(G, {loop.dt:g}), where G is loop.linearize() or the model you "
+                "gave. Otherwise give the loop a digital controller, or put the delay into the "
+                "plant as a Padé approximation (control.pade)"
             )
 
         # The reference jumps or bends only at the samples, so that a period has a smooth motion.
