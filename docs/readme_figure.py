@@ -25,6 +25,7 @@ part = slice(100, 350)
 time = gap.time[part] - gap.time[part][0]
 before, after = gap.simulated_before[part], gap.simulated_after[part]
 measured = gap.measured[part]
+start = "recalibrated model" if gap.before == gap.fitted else "model as given"
 BEFORE, AFTER = "#D55E00", "#0072B2"
 
 mpl.rcParams.update(cid.plot.style())
@@ -35,7 +36,7 @@ output, bars = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[:, 1])
 error = figure.add_subplot(grid[1, 0], sharex=output)
 output.tick_params(labelbottom=False)
 output.plot(time, 1e3 * measured, color="0.72", linewidth=3.5, linestyle="-", label="measured")
-output.plot(time, 1e3 * before, color=BEFORE, linestyle="--", label="simulated, recalibrated model")
+output.plot(time, 1e3 * before, color=BEFORE, linestyle="--", label=f"simulated, {start}")
 output.plot(time, 1e3 * after, color=AFTER, linestyle="-", linewidth=1.0,
             label=f"simulated, with {finding.name}")  # fmt: skip
 output.set_ylabel("distance [mm]")
