@@ -66,15 +66,13 @@ HOSTS = {
     "SensorHum": ANY,
     # No limit of the sensor: readings that sit on it are read off the log, and no filter weighs it.
 }  # fmt: skip
-# Draws of earlier seeds hide what the catalogue had then, and nothing of it was outside.
-LATER = {"InputRateLimit": (96000, ANY)}
 OUTSIDE = {
     "rate limit": ANY, "changing lag": ANY, "cubic drag": MECHANICAL, "soft stop": MECHANICAL,
     "hysteresis": MECHANICAL, "loss of gain": ANY, "play of the sensor": ANY,
     "growing noise": ANY,
 }  # fmt: skip
-# What was outside until the catalogue had it.
-ENTERED = {"rate limit": "InputRateLimit"}
+# What was outside until the catalogue had it: its name there, and the first seed that knows of it.
+ENTERED = {"rate limit": ("InputRateLimit", 96000)}
 # Names that no record can tell apart, by plants.
 SAME = (
     ({"ActuatorLag", "SensorLag"}, ("drive", "spring")),
@@ -422,10 +420,10 @@ def draw_case(name: str, seed: int, n: int = 1500) -> Case:
 
 def list_hosts(name: str, seed: int) -> dict[str, Sequence[str]]:
     """Return what a draw of a class may hide, each with the plants that may have it."""
-    later = {k: plants for k, (first, plants) in LATER.items() if seed >= first}
-    if name != "outside":
-        return {**HOSTS, **later}
-    return {k: plants for k, plants in OUTSIDE.items() if ENTERED.get(k) not in later}
+    entered = {k: known for k, (known, first) in ENTERED.items() if seed >= first}
+    if name == "outside":
+        return {k: plants for k, plants in OUTSIDE.items() if k not in entered}
+    return {**HOSTS, **{known: OUTSIDE[k] for k, known in entered.items()}}
 
 
 def _fill_rig(

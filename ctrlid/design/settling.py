@@ -123,7 +123,9 @@ def _explain_limits(loop: Loop) -> list[str]:
         for name, low, high in zip(inputs, lower, upper, strict=True)
         if np.isfinite([low, high]).any()
     ]
-    for kind, said in ((InputSaturation, "limits the input"), (InputRateLimit, "limits its speed")):
+    for kind, said in (
+        (InputSaturation, "limits the input"), (InputRateLimit, "limits how fast the input moves"),
+    ):  # fmt: skip
         found += [f"{k} {said}" for k, e in loop.labelled.items() if isinstance(e, kind)]
     return found
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -162,7 +162,8 @@ def _grow_model(
         given_values = None if steps else restore_given_values(base)
         step = run_round(model, pool, work, given_values, given, beside=bool(steps))
         # Noise may be coloured and have heavy tails, one after the other.
-        is_stand_in = partial(_is_stand_in, beside=bool(steps))
+        # It may simulate replicas, and is asked of the same effect twice.
+        is_stand_in = cache(partial(_is_stand_in, beside=bool(steps)))
         while (other := prefer_sensor_noise(model, step.best, is_false, is_stand_in)) is not None:
             tell(f"{head}: screening beside other sensor noise")
             model, base = other, base if steps else other

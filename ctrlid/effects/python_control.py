@@ -126,8 +126,8 @@ def make_ordinary(e: Equations, at: OperatingPoint) -> Equations:
     Raises
     ------
     CtrlidError
-        If there is a backlash, whose memory is no state of a continuous system, or a delay ahead
-        of a plant in discrete time.
+        If there is a backlash or a limited rate, whose memory is no state of a continuous
+        system, or a delay ahead of a plant in discrete time.
     """
     if e.memory is not None:
         raise EffectDoesNotApply(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -35,45 +35,29 @@ class InputRange:
     where l and h are the inputs that follow from the lowest and from the highest memory there is.
     They are equal from the sample on at which the input has crossed the gap.
 
-    An actuator of limited rate moves on from where it was at the start. Until it arrives,
-
-    .. math:: u_a = l_k + \lambda (h_k - l_k), \quad \lambda = \frac{m - l}{h - l}
-
-    with the lowest and the highest memory l and h ahead of the first sample, which is exact at both
-    ends: where the actuator rests, and where it is told to be.
-
     Parameters
     ----------
     low, high : ndarray, shape (..., n)
         The lowest and the highest input.
     low_slopes, high_slopes : ndarray, shape (..., n, free)
         Their derivatives by the free parameters.
-    ends : tuple of 2 float, optional
-        The lowest and the highest memory of an actuator that moves by itself.
     """
 
     low: Array
     high: Array
     low_slopes: Array
     high_slopes: Array
-    ends: tuple[float, float] | None = None
 
     def map(self, change: Callable[[Array], Array]) -> InputRange:
         """Return what becomes of all four by the same change, of their samples, say."""
-        low, high = change(self.low), change(self.high)
-        return InputRange(low, high, change(self.low_slopes), change(self.high_slopes), self.ends)
+        return replace(
+            self, low=change(self.low), high=change(self.high),
+            low_slopes=change(self.low_slopes), high_slopes=change(self.high_slopes),
+        )  # fmt: skip
 
     def follow(self, memory: Any) -> Array:
         """Return the input that follows from a known memory at the start."""
-        if self.ends is None:
-            return np.asarray(np.clip(memory, self.low, self.high))
-        return np.asarray(self.low + self._find_share(memory) * (self.high - self.low))
-
-    def _find_share(self, memory: Any) -> Any:
-        """Return where a memory is from the lowest to the highest there is, from 0 to 1."""
-        assert self.ends is not None
-        low, high = self.ends
-        return (memory - low) / (high - low) if high > low else 0.0 * memory
+        return np.asarray(np.clip(memory, self.low, self.high))
 
     def linearize(self, memory: Array, spread: Array) -> tuple[Array, Array, Array]:
         r"""Return the expected input and its derivatives, for a normal memory at the start.
@@ -96,14 +80,6 @@ class InputRange:
         by_parameters : ndarray, shape (..., n, free)
             Its derivatives by the free parameters.
         """
-        if self.ends is not None:
-            share, between = self._find_share(memory), self.high - self.low
-            width = self.ends[1] - self.ends[0]
-            by_parameters = (
-                self.low_slopes
-                + np.asarray(share)[..., None] * (self.high_slopes - self.low_slopes)
-            )  # fmt: skip
-            return self.follow(memory), between / width if width else 0.0 * between, by_parameters
         s = np.maximum(spread, np.finfo(float).tiny)
         with np.errstate(over="ignore"):
             above_low, above_high = (
@@ -117,6 +93,44 @@ class InputRange:
             self.low_slopes * (1 - inside)[..., None] + self.high_slopes * beyond[..., None]
         )
         return applied, inside - beyond, by_parameters
+
+
+@dataclass(frozen=True, eq=False)
+class RampRange(InputRange):
+    r"""What the input behind a limited rate may be at each sample.
+
+    The actuator moves on from where it was at the start. Until it arrives,
+
+    .. math:: u_a = l_k + \lambda (h_k - l_k), \quad \lambda = \frac{m - l}{h - l}
+
+    with the lowest and the highest memory l and h ahead of the first sample, which is exact at both
+    ends: where the actuator rests, and where it is told to be.
+
+    Parameters
+    ----------
+    lowest, highest : float
+        The lowest and the highest memory ahead of the first sample.
+    """
+
+    lowest: float
+    highest: float
+
+    def _find_share(self, way: Any) -> Any:
+        """Return which share of the way from the lowest to the highest memory something is."""
+        width = self.highest - self.lowest
+        return way / width if width > 0 else 0.0 * way
+
+    def follow(self, memory: Any) -> Array:
+        """Return the input that follows from a known memory at the start."""
+        share = self._find_share(memory - self.lowest)
+        return np.asarray(self.low + share * (self.high - self.low))
+
+    def linearize(self, memory: Array, spread: Array) -> tuple[Array, Array, Array]:
+        """Return the expected input and its derivatives, which do not depend on the spread."""
+        del spread
+        share = self._find_share(memory - self.lowest)[..., None]
+        by_parameters = self.low_slopes + share * (self.high_slopes - self.low_slopes)
+        return self.follow(memory), self._find_share(self.high - self.low), by_parameters
 
 
 def find_input_range(
@@ -144,6 +158,7 @@ def find_input_range(
     """
     key = ("input memory", tuple(index), period, held)
     after, slopes = e.derive(key, lambda: _build_maps(e, index, period, held))
+    assert e.memory is not None
     middle, reach = find_memory_range(e, float(u[0]), at_rest, p)
     ends = middle - BEYOND * reach, middle + BEYOND * reach
     found = []
@@ -155,8 +170,8 @@ def find_input_range(
         by_memory = _carry_sensitivity(carried[:, 0], carried[:, 1:])
         found.append((applied[:, 0, 0], seen[:, :1] * by_memory + seen[:, 1:]))
     (low, low_slopes), (high, high_slopes) = found
-    assert e.memory is not None
-    return InputRange(low, high, low_slopes, high_slopes, ends if e.memory.moves else None)
+    found_range = low, high, low_slopes, high_slopes
+    return RampRange(*found_range, *ends) if e.memory.moves else InputRange(*found_range)
 
 
 def _build_maps(
