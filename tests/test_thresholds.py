@@ -195,4 +195,4 @@ def test_a_page_that_states_another_number_is_found():
     with vary_numbers(gate=7.0, held_out=0.2, fitted_samples=50_000):
         found = {page for page, _, _ in disagreements(texts())}
     assert "ctrlid/diagnosis/procedure.py" in found
-    assert "docs/theory/naming_study.rst" in found
+    assert "docs/theory/speed.rst" in found

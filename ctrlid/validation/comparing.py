@@ -74,8 +74,8 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
     record : Record
         The data. Record and model may change places.
     model_or_loop : Loop, IdentifiedModel or control.TransferFunction
-        What to compare with them. A transfer function predicts as the ARX equation does, with the
-        constant part fitted to this record.
+        What to compare with them. A transfer function predicts with a noise polynomial, a
+        result of `fit_arx` with none; polynomial and constant part are fitted to this record.
     horizon : int, optional
         Samples to predict ahead; by default about one time constant of the slowest unstable, or
         else the slowest stable, pole.
