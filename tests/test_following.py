@@ -1,6 +1,7 @@
 """Replicas of records whose controller nobody knows."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import control as ct
 import numpy as np
@@ -11,9 +12,10 @@ import ctrlid as cid
 import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis import replicas
-from ctrlid.diagnosis.noise_tests import run_noise_tests
+from ctrlid.diagnosis.noise_tests import NoiseTests, run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.replicas import (
+    _design_normalized_controller,
     _regress_controller,
     follow_record,
     forgive_filter,
@@ -201,3 +203,34 @@ def test_middle_of_a_dead_zone_is_a_number():
     for wrong in ("middle", np.nan, None):
         with pytest.raises(cid.CtrlidError, match="needs a finite number for centre"):
             E.InputDeadZone(2.0, centre=wrong)
+
+
+@pytest.mark.parametrize("period", [0.05, 0.2, 0.5])
+def test_the_designed_controller_holds_a_plant_that_is_sampled_slowly(period):
+    """1/(s^2 - 25), whose pole times the period is up to 2.5."""
+    plant = ct.ss([[0.0, 1.0], [25.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], 0)
+    one = np.ones(1)
+    law = _design_normalized_controller(plant, period, one, one)
+    sampled = ct.sample_system(plant, period, "zoh")
+    poles = ct.poles(ct.feedback(sampled, law))
+    # A linear quadratic regulator of unit weights mirrors a fast unstable pole or does better.
+    assert np.abs(poles).max() < np.exp(-0.9 * 5.0 * period) + 1e-9
+
+
+def test_what_replicas_fail_as_well_is_forgiven_by_the_reference_of_several_outputs(monkeypatch):
+    axes = ("time", "reference a", "a")
+
+    def tests(p):
+        return NoiseTests(
+            {f"size by {x} of {name}": p.get((x, name), 1.0) for x in axes for name in "ab"},
+            np.zeros(2), dict.fromkeys(axes, np.zeros(2)),
+            outputs=dict.fromkeys("ab", NoiseTests({}, np.zeros(2), {})),
+        )  # fmt: skip
+
+    of_copy = tests({("a", "b"): 1e-9})
+    monkeypatch.setattr(replicas, "run_noise_tests", lambda fit: of_copy)
+    copy = SimpleNamespace(fit=None, loop=SimpleNamespace(effects=()))
+    here = tests({("reference a", "b"): 1e-9, ("reference a", "a"): 1e-9})
+    found = forgive_filter(here, [copy]).p_values
+    assert found["size by reference a of b"] == 0.5
+    assert found["size by reference a of a"] == 1e-9

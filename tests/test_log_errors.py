@@ -166,3 +166,19 @@ def test_a_repair_after_which_the_input_does_nothing_is_none():
     found = find_log_error(Log(loop, [wrong], (), -1e9))
     assert found is not None
     assert "u is a thousand times too large" in found.words
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_wrong_unit_is_seen_beside_the_steps_of_a_converter(loop, known):
+    """The steps are in the log a thousand times too large as well, those of the model are not."""
+    r, u, y = simulate(seed=5)
+    step = 4e-3
+    y = step * np.round(y / step)
+    record = cid.Record(r=1e3 * r, u=u, y=1e3 * y, dt=DT)
+    audits = [cid.audit(record)]
+    assert audits[0].quantum["y"] == pytest.approx(1e3 * step)
+    stepped = loop.with_effect(cid.effects.Quantization(step if known else 1e3 * step))
+    reached = _measure(stepped, [record], audits)
+    found = find_log_error(Log(stepped, [record], audits, reached))
+    assert found is not None
+    assert "y and r are a thousand times too large" in found.words

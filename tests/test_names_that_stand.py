@@ -12,12 +12,13 @@ import ctrlid.effects as E
 from ctrlid.diagnosis.constancy import _estimate_alone, compare_stretches
 from ctrlid.diagnosis.grounds import (
     Case,
+    is_at_a_limit,
     is_one_of_several,
     is_phase_locked,
     narrows_no_gap,
     was_not_checked,
 )
-from ctrlid.diagnosis.recalibration import fit_base_model
+from ctrlid.diagnosis.recalibration import fit_base_model, recalibrate
 from ctrlid.reporting.tables import make_blocks
 
 DT, N = 0.01, 2000
@@ -248,3 +249,25 @@ def test_estimates_of_stretches_scatter_as_they_say():
             z.append(move / variance**0.5)
         assert 0.7 < np.std(z) < 1.3
     assert _estimate_alone(np.zeros((50, 2)), np.ones(50), 0) == (0.0, 0.0)
+
+
+def test_a_limit_within_chance_of_the_given_value_is_none():
+    """Sixty noisy samples say next to nothing of a damping, which ends at ten times the given."""
+    loop = mass(c=0.05)
+    excused = 0
+    for seed in range(5):
+        record = simulate_mass(steps(seed)[:60], lambda t, x, v: 0.0, noise=0.02, seed=seed)
+        model = recalibrate(loop, [record], [cid.audit(record)])
+        at_limit = model.fit.theta[model.names.index("c")] in (0.005, 0.5)
+        if not at_limit:
+            continue
+        errors = dict.fromkeys(model.names, 0.0)
+        case = SimpleNamespace(
+            given=loop, final=model, errors=errors,
+            read_effect=lambda f: ("ConstantForce", E.ConstantForce(0.1)),
+        )  # fmt: skip
+        doubt = model.fit.standard_errors[model.names.index("c")]
+        moved = abs(model.fit.theta[model.names.index("c")] - 0.05)
+        assert bool(is_at_a_limit(case, None)) == (moved > 2 * doubt)
+        excused += moved <= 2 * doubt
+    assert excused

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import casadi
 import control as ct
 import numpy as np
 import pytest
@@ -338,3 +339,53 @@ def test_levels_with_two_pumps_are_diagnosed():
     assert fitted["a"] == pytest.approx(1.1, abs=0.01)
     assert {c.effect.name for c in found.ranking if isinstance(c.effect, E.StateLimit)} == {
         "h1", "h2"}  # fmt: skip
+
+
+@pytest.mark.parametrize("at", ["x_dot", "theta_dot"])
+def test_a_mode_at_one_coordinate_moves_all_through_the_mass_matrix(at):
+    """Held against the equations of motion with the small mass as a coordinate of its own."""
+    rest = cid.Loop(CART, dt=DT, at=at_rest(CART))
+    mode = E.FlexibleMode(frequency=3.0, damping=0.05, coupling=0.2, at=at)
+    loop = rest.with_effect(mode)
+    state, push, deflection, speed = np.array([0.1, 0.4, 0.2, -0.3]), 0.7, 0.01, 0.05
+    j = ["x_dot", "theta_dot"].index(at)
+    free = evaluate_rates(rest, state, push)[2:4]
+
+    def accelerate(force, torque):
+        return np.array(CART.mechanism.updfcn(0, state, [force, torque], CART.params))[2:4]
+
+    inverse = np.column_stack(
+        [accelerate(1, 0) - accelerate(0, 0), accelerate(0, 1) - accelerate(0, 0)]
+    )
+    mass = np.linalg.inv(inverse)
+    small = 0.2 / inverse[j, j]
+    omega = 2 * np.pi * 3.0
+    w = omega * (omega * deflection + 2 * 0.05 * speed)
+    # (M - m2 e e') q" = M a + m2 w e for the coordinates, d" = -w - q_j" for the deflection.
+    left, right = mass.copy(), mass @ free
+    left[j, j] -= small
+    right[j] += small * w
+    expected = np.linalg.solve(left, right)
+    found = evaluate_rates(loop, np.array([*state, deflection, speed]), push)
+    np.testing.assert_allclose(found[2:4], expected, rtol=1e-9)
+    assert found[5] == pytest.approx(-w - expected[j], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("effect", "unit"),
+    [
+        (E.QuadraticDrag(c2=0.1, at="x_dot"), "N s^2/m^2"),
+        (E.CubicStiffness(k3=2.0, at="x_dot"), "N/m^3"),
+        (E.EddyCurrentDamping(ce=0.1, at="x_dot"), "N s/(m N^2)"),
+        (E.CubicStiffness(k3=2.0, at="theta_dot"), "N m/rad^3"),
+    ],
+)
+def test_a_size_counted_per_square_or_cube_is_one_of_a_force_as_well(effect, unit):
+    loop = cart(effect)
+    assert f" {unit}" in loop.effects[0].text(loop)
+
+
+def evaluate_rates(loop, x, u):
+    e = loop.equations(keep=True)
+    rates = casadi.Function("rates", [e.t, e.x, e.u, e.p], [e.rhs])
+    return rates(0.0, x, u, list(e.parameters.values())).full()[:, 0]

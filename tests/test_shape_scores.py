@@ -8,6 +8,7 @@ import pytest
 
 import ctrlid as cid
 import problems
+from ctrlid import effects as E
 from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.shape_scores import compute_score_probability
@@ -139,3 +140,18 @@ def test_a_quantity_counts_where_it_moves_in_one_record_of_several():
     fit = fit_base_model(loop, [moved, without], loop.free).fit
     shapes, _ = split(run_noise_tests(fit).p_values)
     assert len(shapes) == 15  # all but the reference, which one record does not have
+
+
+def test_a_slope_of_the_input_shows_where_the_input_acts():
+    """The force of a period depends on the input at its beginning, not on that before it.
+
+    An input that is drawn anew for every sample tells one from the other.
+    """
+    rng = np.random.default_rng(9950)
+    bend = E.InputNonlinearity(curvature=0.02)
+    loop = replace(drive_of(), controller=None)
+    u = rng.uniform(-3.0, 3.0, 1500)
+    record = cid.simulate(loop.with_effect(bend), d=u, sensor_noise=1e-4, seed=9951)
+    p = seen_in(loop, record)
+    # By the input a sample before, the probability is 7e-5; it is 8e-86 by the one that acts.
+    assert p["slope by input"] < 1e-20

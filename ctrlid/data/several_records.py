@@ -30,7 +30,7 @@ def as_records(data: Any) -> tuple[Record, ...]:
     Raises
     ------
     CtrlidError
-        If something else is among them, or sampling period or hold differ.
+        If something else is among them, or sampling period, hold or hold of the reference differ.
     """
     records = (data,) if isinstance(data, Record) else data
     if not isinstance(records, list | tuple):
@@ -124,6 +124,12 @@ def _require_same_kind(first: Record, record: Record) -> None:
             "records used together need the same sampling period and the same hold; given "
             f"{first.dt:.10g} s, {first.hold!r} and {record.dt:.10g} s, {record.hold!r}. Decimate "
             "the faster one, or give both the hold that describes their input better"
+        )
+    if first.r is not None and record.r is not None and record.hold_r != first.hold_r:
+        raise CtrlidError(
+            "records used together need references that run alike between samples; given "
+            f"hold_r={first.hold_r!r} and hold_r={record.hold_r!r}. Give both the one that is "
+            "right, as in dataclasses.replace(record, hold_r='zoh')"
         )
 
 

@@ -178,6 +178,8 @@ def list_candidates(
     catalogue: Sequence[type[AbstractEffect]], loop: Any, record: Record
 ) -> list[AbstractEffect]:
     """Return every effect of a catalogue that a plant can have, at its start."""
+    # What a sample holds that does not count must not set a range.
+    record = _hold_last_valid(record)
     found: list[AbstractEffect] = []
     for kind in catalogue:
         if needs_place(loop, kind):
@@ -185,6 +187,25 @@ def list_candidates(
         else:
             found += kind.candidates(loop, record)
     return found
+
+
+def _hold_last_valid(record: Record) -> Record:
+    """Return a record in which samples that do not count repeat the last one that does."""
+    n, seen = len(record), np.asarray(record.valid_samples)
+    each = np.reshape(record.valid_outputs, (-1, n))
+    if seen.all() and each.all():
+        return record
+    u, y = (np.reshape(v, (-1, n)) for v in (record.u, record.y))
+    u, y = (
+        u[:, _find_last(seen)],
+        np.array([row[_find_last(use)] for row, use in zip(y, each, strict=True)]),
+    )
+    return replace(record, u=u.reshape(np.shape(record.u)), y=y.reshape(np.shape(record.y)))
+
+
+def _find_last(valid: Any) -> Any:
+    """Return for each sample the last one that counts, or else the first."""
+    return np.maximum.accumulate(np.where(valid, np.arange(len(valid)), np.argmax(valid)))
 
 
 def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:

@@ -185,7 +185,8 @@ def carry_over_fit(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
         if name in base.names:
             i = base.names.index(name)
             lower[k], upper[k] = old.lower[i], old.upper[i]
-    seen = RecordRange(plant, max(len(one.record) for one in data) * loop.dt, tuple(at))
+    # Stretches of a long record are parts of one experiment, whose time goes on in them.
+    seen = RecordRange(plant, max(float(one.t[-1]) for one in data) + loop.dt, tuple(at))
     for label, effect in loop.labelled.items():
         for key, (low, high) in effect.limits(seen).items():
             if f"{label}.{key}" in names:

@@ -15,6 +15,7 @@ from .._base.statistics import autocorrelation_time, pseudo_inverse
 from .._base.text import write_count
 from ..data.record import Record
 from ..data.several_records import require_valid_samples
+from ..effects import SensorSaturation
 from ..estimation.likelihood.kalman_filter import compute_memory
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate_likelihood, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
@@ -30,6 +31,7 @@ from ..validation.reproduction import CLOSED_LOOP, Reproduction, choose_reproduc
 from . import gap as gaps
 from .fitted_model import Model
 from .recalibration import cut_stretches
+from .records import censor_record
 from .thresholds import THRESHOLD
 
 
@@ -53,6 +55,18 @@ class FreshData:
             return tuple(_fit_private_parameters(model, w) for w in self.windows)
         return (self._fit_loop(model, self.rest),) * len(self.windows)
 
+    def censor(self, limits: SensorSaturation) -> Self:
+        """Return the same with readings on a limit of the sensor left out of every filter.
+
+        A simulation has the limit itself, and is compared there as well.
+        """
+        windows = tuple(
+            replace(w, readable=np.asarray(censor_record(w.record, limits).valid))
+            for w in self.windows
+        )
+        rest = self.rest and tuple(censor_record(one, limits) for one in self.rest)
+        return replace(self, windows=windows, rest=rest)
+
     def halve(self) -> tuple[Self, Self]:
         """Return the first and the second half of what is compared."""
         first, second = gaps.halve_windows(self.windows)
@@ -71,8 +85,9 @@ class FreshData:
             return model.fitted
         parts, start_times = cut_stretches(records)
         problem = make_problem(model.fitted, model.names, parts, start_times)
-        # What is believed stays about the values of the model as given.
-        problem = replace(problem, priors=fit.problem.priors)
+        # What is believed stays about the values of the model as given, and so do the limits.
+        of_fit = fit.problem
+        problem = replace(problem, priors=of_fit.priors, lower=of_fit.lower, upper=of_fit.upper)
         known = fit.known
         if known is not None and (known.sensor is None or len(parts) == len(known.sensor)):
             problem = replace(problem, known=known)
@@ -124,7 +139,8 @@ class FreshData:
             np.zeros(len(errors)), covariance / np.outer(errors, errors), THRESHOLD.size_runs,
             method="eigh",
         )  # fmt: skip
-        theta = np.clip(fit.theta + draws * errors, fit.problem.lower, fit.problem.upper)
+        centre = np.array([loops[0].parameters[name] for name in model.names])
+        theta = np.clip(centre + draws * errors, fit.problem.lower, fit.problem.upper)
         found = []
         for values in theta.tolist():
             known = {n: v for n, v in zip(model.names, values, strict=True) if n not in private}
@@ -141,7 +157,7 @@ class FreshData:
         known = replace(known, sensor=np.full(1, float(np.mean(fit.sensor))))
         total = 0.0
         for loop, window in zip(loops, self.windows, strict=True):
-            problem = make_problem(loop, (), [window.record], [window.start_time])
+            problem = make_problem(loop, (), [window.seen], [window.start_time])
             here = begin_fit(replace(problem, known=known))
             # Of several outputs the innovations have a column, the mask a row for each.
             z = here.standardized[0].T[window.mask]
@@ -170,7 +186,7 @@ class FreshData:
         for loop, window in zip(loops, self.windows, strict=True):
             plain, record = replace(loop, controller=None), window.record
             try:
-                problem = make_problem(plain, (), [record], [window.start_time])
+                problem = make_problem(plain, (), [window.seen], [window.start_time])
                 here = begin_fit(replace(problem, known=known))
             except ModelCannotRun:
                 return math.nan
@@ -181,7 +197,7 @@ class FreshData:
                 here.linearized[0], fit.noise, record.valid_samples, horizon
             )
             measured, made, masks = (
-                np.reshape(v, (outputs, -1)) for v in (record.y, y.T, window.mask)
+                np.reshape(v, (outputs, -1)) for v in (record.y, y.T, window.predicted)
             )
             for k, mask in enumerate(masks):
                 use = mask[index] & np.isfinite(made[k])
@@ -250,7 +266,9 @@ def choose_fresh_data(
         windows, rest = zip(*(gaps.hold_out(r) for r in records), strict=True)
     else:
         windows = tuple(gaps.make_window(r) for r in validation)
-    return FreshData(windows, rest, choose_reproduction(loop, windows[0].record))
+    # Gaps of several windows are one number only if all of them are reproduced in the same way.
+    ways = [choose_reproduction(loop, w.record) for w in windows]
+    return FreshData(windows, rest, next((way for way in ways if way.horizon), ways[0]))
 
 
 def check_length(fresh: FreshData) -> None:
@@ -286,7 +304,7 @@ def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:
         return loop
     sensor = np.full(1, float(np.mean(fit.sensor)))
     try:
-        problem = make_problem(loop, names, [window.record], [window.start_time])
+        problem = make_problem(loop, names, [window.seen], [window.start_time])
         problem = replace(problem, known=Known(fit.noise, sensor))
         start = begin_fit(problem)
         at = start.trajectories

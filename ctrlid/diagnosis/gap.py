@@ -33,7 +33,7 @@ class Window:
     `start_time` is the time of its first sample since the start of the record, `mask` what is
     compared. Of several outputs `mask` has a row for each, and their errors count in units of
     `scales`, the floors. `noises` are draws of sensor noise and random force, with which loops are
-    simulated.
+    simulated. `readable` tells which samples are not on a limit of the sensor, if it has one.
     """
 
     record: Record
@@ -41,6 +41,19 @@ class Window:
     mask: Any
     scales: tuple[float, ...] = ()
     noises: tuple[Sequence[Array], ...] = ()
+    readable: Any = None
+
+    @property
+    def seen(self) -> Record:
+        """The record as a filter may take it: a reading on a limit of the sensor is none."""
+        if self.readable is None:
+            return self.record
+        return replace(self.record, valid=np.asarray(self.record.valid) & self.readable)
+
+    @property
+    def predicted(self) -> Any:
+        """What is compared of a prediction: of a reading on a limit it does not know how far."""
+        return self.mask if self.readable is None else self.mask & self.readable
 
     def choose_output(self, k: int) -> "Window":
         """Return the same for one of several outputs, in its own unit."""
@@ -148,7 +161,7 @@ def measure_trivial_error(windows: Sequence[Window], horizon: int) -> float:
     while 2 * lengths[-1] <= horizon:
         lengths.append(2 * lengths[-1])
     return min(
-        root_mean_square(windows, [_extrapolate_outputs(w.record, horizon, n) for w in windows])
+        root_mean_square(windows, [_extrapolate_outputs(w.seen, horizon, n) for w in windows])
         for n in lengths
     )
 
@@ -175,16 +188,18 @@ def _extrapolate_outputs(record: Record, horizon: int, samples: int) -> Array:
 def _extrapolate(record: Record, horizon: int, samples: int) -> Array:
     """Return each output by the straight line of least squares through samples before it.
 
-    The last of them is `horizon` samples before. One sample is the last value, which also stands
-    where a line has too few.
+    The last of them is `horizon` samples before. One sample is the last valid value, which also
+    stands where a line has too few.
     """
     ago = np.arange(float(samples))
     middle = ago - np.mean(ago)
     slope = -middle / np.sum(middle**2) if samples > 1 else middle
     weights: Array = 1 / samples + (horizon + np.mean(ago)) * slope
-    y = np.where(record.valid, record.y, 0.0)
+    valid = np.asarray(record.valid)
+    last = np.maximum.accumulate(np.where(valid, np.arange(len(valid)), np.argmax(valid)))
+    y = np.asarray(record.y, dtype=float)[last]
     line = np.append(np.full(horizon, np.nan), np.convolve(weights, y)[: len(y) - horizon])
-    known = find_whole_past(np.asarray(record.valid), horizon + samples - 1)
+    known = find_whole_past(valid, horizon + samples - 1)
     return np.where(known, line, np.append(np.full(horizon, np.nan), y[:-horizon]))
 
 
@@ -325,9 +340,10 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     try:
         if how.horizon:
             first = window.start_time
-            made = predict_from(loop, record, first)
+            made = predict_from(loop, window.seen, first)
             index, values = predict_ahead(loop, record, made, how.horizon, first)
             y[..., index] = values.T
+            y[~window.predicted] = np.nan
             return y
         simulator = make_gap_simulator(loop, record.hold, record.hold_r)
     except (ModelCannotRun, EffectDoesNotApply):
@@ -501,7 +517,7 @@ def _simulate_noise(
     size = np.count_nonzero(window.mask, axis=-1)
     if how.horizon:
         first = window.start_time
-        made = predict_from(loop, record, first)
+        made = predict_from(loop, window.seen, first)
         known = np.array(predict_spread(loop, record, made, how.horizon, first))
         if known.ndim == 2:
             squares = size[:, None, None] * known.T[:, None, :] ** 2

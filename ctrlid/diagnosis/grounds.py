@@ -69,6 +69,9 @@ def is_at_a_limit(case: Case, f: Weighed) -> str:
     given, problem = case.given.parameters, case.final.fit.problem
     label, effect = case.read_effect(f)
     about = {f"{label}.{p.name}": p for p in effect.parameters()}
+    # What is at its bound has no standard error in the answer, but one in the fit.
+    fitted = case.final.fit.standard_errors
+    doubts = dict(zip(case.final.names, fitted.tolist(), strict=True))
     for name, value, low, high in zip(
         case.final.names, case.final.fit.theta, problem.lower, problem.upper, strict=True
     ):
@@ -78,9 +81,8 @@ def is_at_a_limit(case: Case, f: Weighed) -> str:
         # A size may end where its effect begins or vanishes, as in a search.
         ends = own is not None and (own.searched or own.neutral not in (None, low, high))
         moved = abs(value - given.get(name, value))
-        if ends or (
-            "." not in name and moved > _compute_reach_of_chance(case.errors.get(name, math.nan))
-        ):
+        doubt = case.errors.get(name) or doubts[name]
+        if ends or ("." not in name and moved > _compute_reach_of_chance(doubt)):
             return f"{name} went to its limit, {value:.4g}"
     return ""
 

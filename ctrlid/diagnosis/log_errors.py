@@ -9,6 +9,7 @@ import numpy as np
 
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
+from ..effects import Quantization
 from ..estimation.likelihood.maximization import choose_sensor_noise
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
@@ -117,11 +118,12 @@ def find_log_error(log: Log) -> LogError | None:
     LogError or None
         The best repair, with those that do as well in the same sentence; None if none helps.
     """
-    loop, heads = log.loop, log.heads
+    heads = log.heads
     found: list[tuple[float, str]] = []
     goal = log.reached + THRESHOLD.gate
     for words, repair, factor, early in _list_repairs():
         left_out = early * len(heads)
+        loop = _scale_steps(log, factor)
         if _measure(loop, [repair(r) for r in heads], None, factor, left_out) < log.least:
             continue
         whole = [repair(r) for r in log.records]
@@ -198,6 +200,20 @@ def _scale(record: Record, input_factor: float, output_factor: float) -> Record:
         y=output_factor * np.asarray(record.y),
         r=None if record.r is None else output_factor * np.asarray(record.r),
     )
+
+
+def _scale_steps(log: Log, factor: float) -> Loop:
+    """Return the loop for outputs times a factor: the steps that the log shows are scaled as well.
+
+    A step that the model has from elsewhere is in the units of the model already.
+    """
+    shown = [a.quantum.get("y", 0.0) for a in log.audits]
+    effects = tuple(
+        replace(e, step=e.step * abs(factor))
+        if isinstance(e, Quantization) and any(math.isclose(e.step, q) for q in shown) else e
+        for e in log.loop.effects
+    )  # fmt: skip
+    return replace(log.loop, effects=effects) if effects != log.loop.effects else log.loop
 
 
 def _delay_output(record: Record) -> Record:

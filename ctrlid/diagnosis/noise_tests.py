@@ -131,8 +131,13 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
         found = _test_output(fit, fit.standardized, axes)
     else:
         found = _test_several_outputs(fit, axes)
+    e = fit.plant.e
+    late = (
+        ["input", "input change"] if e.siso else [*e.inputs, *(f"change of {u}" for u in e.inputs)]
+    )
     p_values = {
-        **found.p_values, **run_constancy_tests(fit, found.axes), **run_shape_tests(fit, axes)
+        **found.p_values, **run_constancy_tests(fit, found.axes),
+        **run_shape_tests(fit, axes, late),
     }  # fmt: skip
     return replace(found, p_values=p_values)
 
@@ -174,7 +179,10 @@ def _test_across(fit: Fit) -> float:
     value, df = 0.0, 0
     for z in fit.standardized:
         filled = np.nan_to_num(z)
+        # Outputs that are never read together cannot be compared.
         n = int(np.isfinite(z).all(axis=1).sum())
+        if not n:
+            continue
         for i, j in itertools.permutations(range(z.shape[1]), 2):
             rho = compute_lagged_products(filled[:, i], filled[:, j], THRESHOLD.lags)[1:] / n
             value += float(n * np.sum(rho**2))
@@ -190,8 +198,10 @@ def _test_output(
     white_df = cross_df = 0
     lines, tails, shapes, slopes = [], [], [], []
     sizes, sizes_df = 0.0, 0
-    # Fitted coefficients of the noise take as many correlations to zero.
-    p = len(fit.theta) + len(fit.noise.ar) + len(fit.noise.ma)
+    # Fitted parameters take as many correlations to zero, those of several outputs in all of them;
+    # coefficients of the noise take none with the past of other signals.
+    p = len(fit.theta) // (fit.data[0].y.shape[1] if output is not None else 1)
+    colours = len(fit.noise.ar) + len(fit.noise.ma)
     for z, out, data, (_, width) in zip(
         standardized, fit.filtered, fit.data, fit.working, strict=True
     ):
@@ -228,7 +238,7 @@ def _test_output(
     tails_and_events = _test_tails(z)
     of_noise = {*tails_and_events}
     p_values = {
-        "whiteness": float(stats.chi2.sf(white, max(white_df - p, 1))),
+        "whiteness": float(stats.chi2.sf(white, max(white_df - p - colours, 1))),
         "independence of past signals": float(stats.chi2.sf(cross, max(cross_df - p, 1))),
         "a single line in the spectrum": min(1.0, min(lines) * len(lines)),
         **tails_and_events,

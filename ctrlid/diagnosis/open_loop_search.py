@@ -277,7 +277,15 @@ class SimulationSight:
 
     def strongest_line(self) -> float:
         """Return the frequency of the strongest line in the errors of the simulation [Hz]."""
-        return find_strongest_line(self.simulated.errors, self.simulated.task.records[0].dt)
+        task, parts, first = self.simulated.task, [], 0
+        for data in task.problem.data:
+            # A sample that does not count keeps its place in time.
+            part = np.zeros(len(data.valid))
+            count = int(np.count_nonzero(data.valid))
+            part[data.valid] = self.simulated.errors[first : first + count]
+            parts.append(part)
+            first += count
+        return find_strongest_line(max(parts, key=len), task.records[0].dt)
 
 
 def _make_trial(t: Tried, base: Model) -> Trial:

@@ -280,6 +280,8 @@ def _answer_question(q: Question, start: Model | None = None) -> tuple[Diagnosis
     """
     # Step 1: what the readout of the sensor shows by itself is no candidate.
     readout = read_limits(q.loop, q.records, q.audits, q.catalogue)
+    if readout.limits is not None:
+        q = replace(q, fresh=q.fresh.censor(readout.limits))
     # Step 2: a wrong value of a parameter is no missing effect.
     q.tell("recalibrating")
     base = start or sharpen_model(recalibrate(readout.loop, readout.records, q.audits))

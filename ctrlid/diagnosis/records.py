@@ -121,10 +121,14 @@ class Readout:
 
 @dataclass(frozen=True, eq=False)
 class ReadLimits:
-    """Loop and records after the limits of the sensor were read off, and what was found so."""
+    """Loop and records after the limits of the sensor were read off, and what was found so.
+
+    `limits` are those of the sensor, known before or read off; None where it has none.
+    """
 
     loop: Loop
     records: tuple[Record, ...]
+    limits: SensorSaturation | None
     found: tuple[Readout, ...]
 
 
@@ -132,19 +136,32 @@ def read_limits(
     loop: Loop, records: Sequence[Record], audits: Sequence[Audit],
     catalogue: Sequence[type[AbstractEffect]],
 ) -> ReadLimits:  # fmt: skip
-    """Return the loop with the sensor's limits and the records without samples that sit on them."""
+    """Return the loop with the sensor's limits and the records without samples that sit on them.
+
+    Limits that the loop has are no finding, unless readings stop inside of them.
+    """
     # Samples on a limit are left out of one output alone; of several the audit tells of them.
-    found = read_clipping(records, audits, catalogue) if loop.equations().siso else None
-    if found is None:
-        return ReadLimits(loop, tuple(records), ())
-    used = tuple(censor_record(record, found.effect) for record in records)
-    return ReadLimits(loop.with_effect(found.effect), used, (found,))
+    if not loop.equations().siso:
+        return ReadLimits(loop, tuple(records), None, ())
+    own = [e for e in loop.effects if isinstance(e, SensorSaturation)]
+    known = SensorSaturation(max((e.lower for e in own), default=-math.inf),
+                             min((e.upper for e in own), default=math.inf))  # fmt: skip
+    found = read_clipping(records, audits, catalogue, known)
+    if found is not None:
+        loop, inside = loop.with_effect(found.effect), found.effect.values()
+        known = SensorSaturation(max(known.lower, inside["lower"]),
+                                 min(known.upper, inside["upper"]))  # fmt: skip
+    if known.neutral:
+        return ReadLimits(loop, tuple(records), None, ())
+    used = tuple(censor_record(record, known) for record in records)
+    return ReadLimits(loop, used, known, () if found is None else (found,))
 
 
 def read_clipping(
-    records: Sequence[Record], audits: Sequence[Audit], catalogue: Sequence[type[AbstractEffect]]
-) -> Readout | None:
-    r"""Return the limits of the sensor if samples sit on them.
+    records: Sequence[Record], audits: Sequence[Audit],
+    catalogue: Sequence[type[AbstractEffect]], known: SensorSaturation,
+) -> Readout | None:  # fmt: skip
+    r"""Return the limits of the sensor if samples sit on them, inside of those that are known.
 
     A sensor without limits is above a value as often as below it, so that n samples exactly on
     the largest value, and none beyond, have a chance of :math:`2^{-n}`.
@@ -157,10 +174,11 @@ def read_clipping(
         if "y" not in found.saturated:
             continue
         size = int(np.count_nonzero(record.valid))
+        slack = THRESHOLD.rounding * float(np.ptp(record.y))
         share_low, share_high, at_low, at_high = found.saturated["y"]
-        if share_low > THRESHOLD.clipped:
+        if share_low > THRESHOLD.clipped and at_low > known.lower + slack:
             low, lower = low + share_low * size, max(lower, at_low)
-        if share_high > THRESHOLD.clipped:
+        if share_high > THRESHOLD.clipped and at_high < known.upper - slack:
             high, upper = high + share_high * size, min(upper, at_high)
     if not low + high:
         return None
@@ -169,9 +187,8 @@ def read_clipping(
         k: 0.0 for k, v in effect.values().items() if math.isfinite(v)})  # fmt: skip
 
 
-def censor_record(record: Record, effect: AbstractEffect) -> Record:
+def censor_record(record: Record, effect: SensorSaturation) -> Record:
     """Return a record in which samples on a limit of the sensor do not count."""
-    assert isinstance(effect, SensorSaturation)
     slack = THRESHOLD.rounding * float(np.ptp(record.y))
     y = np.asarray(record.y)
     free = (y > effect.lower + slack) & (y < effect.upper - slack)

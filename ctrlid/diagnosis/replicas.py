@@ -209,7 +209,7 @@ def forgive_filter(tests: NoiseTests, copies: Sequence[Model | None]) -> NoiseTe
     p = {}
     kin = {
         f"size by {outer}{end}": [f"size by {axis}{end}" for axis in tests.axes]
-        for outer in ("time", "reference")
+        for outer in ("time", *(axis for axis in tests.axes if axis.startswith("reference")))
         for end in ("", *(f" of {name}" for name in tests.outputs))
     }
     for name, value in tests.p_values.items():
@@ -313,10 +313,8 @@ def _design_normalized_controller(model: Any, dt: float, u: Array, y: Array) -> 
         plant = plant if plant.dt else ct.sample_system(plant, dt, "zoh")
         a, b, c = plant.A, plant.B * u, plant.C / y[:, None]
         feedback, _, _ = ct.dlqr(a, b, c.T @ c, np.eye(len(u)))
+        # The gain is that of the predictor: what is measured acts at the next sample.
         gain, _, _ = ct.dlqe(a, np.eye(len(a)), c, b @ b.T, np.eye(len(y)))
     except ValueError:
         return None
-    # The estimate is predicted: what is measured acts at the next sample.
-    through = a @ gain
-    matrix = a - b @ feedback - through @ c
-    return ct.ss(matrix, through / y, feedback * u[:, None], 0, plant.dt)
+    return ct.ss(a - b @ feedback - gain @ c, gain / y, feedback * u[:, None], 0, plant.dt)

@@ -65,7 +65,8 @@ def merge_diagnoses(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
                     "The cause of this difference is not in the model.")  # fmt: skip
     return replace(
         lead, verdict=verdict, sentence=sentence, findings=findings, loop=complete,
-        gap=_merge_gaps(lead, parts), ranking=_merge_rankings(parts), calibrated=calibrated,
+        gap=_merge_gaps(lead.gap, [p.gap for p in parts]), ranking=_merge_rankings(parts),
+        calibrated=calibrated,
         tests={name: min(p.tests.get(name, 1.0) for p in parts) for name in lead.tests},
         notes=tuple(notes),
     )  # fmt: skip
@@ -179,16 +180,21 @@ def _write_sentence(findings: Sequence[Finding], records: int) -> str:
     return f"The model lacks {join_names(findings, seen)}. With {them} the residuals are noise."
 
 
-def _merge_gaps(lead: Diagnosis, parts: Sequence[Diagnosis]) -> Gap:
+def _merge_gaps(lead: Gap, parts: Sequence[Gap]) -> Gap:
     """Return the RMS over all records; the curves are those of one."""
-    weights = np.array([p.gap.samples or len(p.gap.time) for p in parts], dtype=float)
+    weights = np.array([p.samples or len(p.time) for p in parts], dtype=float)
 
     def rms(name: str) -> float:
-        sizes = np.array([getattr(p.gap, name) for p in parts])
+        sizes = np.array([getattr(p, name) for p in parts])
         return float(np.sqrt(np.average(sizes**2, weights=weights)))
 
-    given, before, after, floor = map(rms, ("given", "before", "after", "floor"))
-    return replace(lead.gap, given=given, before=before, after=after, floor=floor)
+    pairs = zip(lead.outputs, zip(*(p.outputs for p in parts), strict=True), strict=True)
+    return replace(
+        lead, given=rms("given"), before=rms("before"), after=rms("after"), floor=rms("floor"),
+        recalibrated=rms("fitted"), trivial=rms("trivial"), widest=max(p.widest for p in parts),
+        samples=sum(p.samples for p in parts),
+        outputs=tuple(_merge_gaps(one, of) for one, of in pairs),
+    )  # fmt: skip
 
 
 def _merge_rankings(parts: Sequence[Diagnosis]) -> tuple[Candidate, ...]:

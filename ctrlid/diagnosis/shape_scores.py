@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -148,7 +148,7 @@ def _add_to_reading(lin: Linearized, shape: Array, output: int) -> Columns:
     return np.zeros((*lin.dp.shape[:2], shape.shape[1])), read
 
 
-def run_shape_tests(fit: Fit, axes: Axes) -> dict[str, float]:
+def run_shape_tests(fit: Fit, axes: Axes, late: Collection[str]) -> dict[str, float]:
     r"""Test that no force, no slope of the input and no error of the reading depends on anything.
 
     With the score g and the information H of `score_shapes`, of a force that is one in one bin of a
@@ -167,6 +167,9 @@ def run_shape_tests(fit: Fit, axes: Axes) -> dict[str, float]:
         The fitted model.
     axes : sequence of mapping of str to ndarray
         For each record, the values of each quantity at all its samples.
+    late : collection of str
+        Quantities that are given as they were a sample before, such as the input that acted until
+        a reading. A force over a period depends on what they are at its beginning.
 
     Returns
     -------
@@ -195,7 +198,9 @@ def run_shape_tests(fit: Fit, axes: Axes) -> dict[str, float]:
         width = bins[0].shape[1]
         if width < 2:
             continue
-        kinds = _list_kinds(fit, bins)
+        # The last period ends behind the last reading.
+        acting = [np.append(b[1:], b[-1:], axis=0) for b in bins] if name in late else bins
+        kinds = _list_kinds(fit, acting, bins)
         columns = [
             (
                 np.concatenate([states for states, _ in parts], axis=-1),
@@ -212,14 +217,19 @@ def run_shape_tests(fit: Fit, axes: Axes) -> dict[str, float]:
     return p_values
 
 
-def _list_kinds(fit: Fit, bins: Sequence[Array]) -> dict[str, list[Columns]]:
-    """Return what the bins do in each record, by the kind of what depends on the quantity."""
+def _list_kinds(
+    fit: Fit, acting: Sequence[Array], bins: Sequence[Array]
+) -> dict[str, list[Columns]]:
+    """Return what the bins do in each record, by the kind of what depends on the quantity.
+
+    Forces are as those say that act in the period from a sample on, readings as those until it.
+    """
     outputs, forces = name_noise_places(fit.plant.loop)
     if fit.plant.channels == 1:
         forces = ("",)  # One force acts on all velocities of a plant with one output.
     inputs = fit.plant.e.inputs
     kinds: dict[str, list[Columns]] = {}
-    for data, lin, chosen in zip(fit.data, fit.linearized, bins, strict=True):
+    for data, lin, chosen, before in zip(fit.data, fit.linearized, acting, bins, strict=True):
         u = np.reshape(data.u, (len(data.u), -1))
         away = u - np.mean(u[np.reshape(data.valid, (len(data.valid), -1)).all(axis=1)], axis=0)
         for j, name in enumerate(forces):
@@ -230,7 +240,7 @@ def _list_kinds(fit: Fit, bins: Sequence[Array]) -> dict[str, list[Columns]]:
                 kinds.setdefault(f"slope{of}{place}", []).append(_push(lin, by, sloped))
         for k, name in enumerate(outputs):
             of = f" of {name}" if len(outputs) > 1 else ""
-            kinds.setdefault(f"reading{of}", []).append(_add_to_reading(lin, chosen, k))
+            kinds.setdefault(f"reading{of}", []).append(_add_to_reading(lin, before, k))
     return kinds
 
 

@@ -281,8 +281,13 @@ class AbstractEffect(metaclass=CheckedCalls):
         if not force:
             return units
         # Of accelerations and what is counted per velocity or position, these are the forces.
-        forces = {fill_unit("{y}/s^2", {"y": position}): force, "1/s": f"{force} s/{position}",
-                  "1/s^2": f"{force}/{position}"}  # fmt: skip
+        u = signals.get("u", "")
+        forces = {
+            "{y}/s^2": force, "1/s": f"{force} s/{position}", "1/s^2": f"{force}/{position}",
+            "1/{y}": f"{force} s^2/{position}^2", "1/(s^2 {y}^2)": f"{force}/{position}^3",
+            "1/(s {u}^2)": f"{force} s/({position} {u}^2)",
+        }  # fmt: skip
+        forces = {fill_unit(key, signals): unit for key, unit in forces.items()}
         return {name: forces.get(unit, unit) for name, unit in units.items()}
 
     def text(self, loop: Any = None) -> str:
@@ -395,7 +400,8 @@ class AbstractEffect(metaclass=CheckedCalls):
         own_point = at
         if not e.siso:
             own_point = OperatingPoint(at.states, at.inputs[here[0]], at.outputs[here[1]])
-        m = Moment(e, own_point, dt, {name: Symbol(s) for name, s in own.items()}, *here)
+        own_states = {name: Symbol(s) for name, s in own.items()}
+        m = Moment(e, own_point, dt, own_states, *here, named=bool(self.at))
         rates = tuple(trace_hook(symbolic.rates)(m))
         if len(rates) != len(own):
             raise CtrlidError(f"{type(self).__name__}.rates returned {len(rates)} rates for the "

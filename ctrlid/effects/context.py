@@ -183,12 +183,12 @@ class Moment:
 
     def __init__(
         self, e: Equations, at: OperatingPoint, dt: float, own: dict[str, Any], u: int = 0,
-        y: int = 0, motion: tuple[int | None, int] | None = None,
+        y: int = 0, motion: tuple[int | None, int] | None = None, named: bool = False,
     ) -> None:  # fmt: skip
         self._e, self._motion = e, motion
-        # What a force at a place of its own accelerates its velocity by; else it is one already.
+        # What a force at a named place accelerates its velocity by; elsewhere it is one already.
         self._push: Any = 1.0
-        if motion is not None and e.pushes is not None:
+        if named and motion is not None and e.pushes is not None:
             self._push = Symbol(e.pushes[motion[1], e.velocities.index(motion[1])])
         self.at, self.dt, self.own = at, dt, own
         self.t: Any = Symbol(e.t)
@@ -233,6 +233,14 @@ class Moment:
     def acceleration(self) -> Any:
         """Acceleration of the moving mass without this effect."""
         return Symbol(self._e.rhs[self._require_motion()[1]])
+
+    def find_force(self, acceleration: Any) -> Any:
+        """Return the force that accelerates the moving mass so much, as `force` returns it.
+
+        Where `Loop.forces` tells the inertia it is in the unit of its input, elsewhere it is the
+        acceleration itself.
+        """
+        return acceleration / self._push
 
     @property
     def deviation(self) -> Any:

@@ -348,8 +348,9 @@ class FlexibleMode(ForceEffect):
     .. math:: \ddot x = \frac{a + \mu\,w}{1 - \mu}, \quad \ddot q = -w - \ddot x, \quad
         w = \omega^2 q + 2 \zeta \omega \dot q, \quad \omega = 2 \pi f
 
-    where a is the acceleration without it, of both masses together, and q the deflection. The
-    plant's response has a notch at f and a resonance at :math:`f/\sqrt{1 - \mu}`.
+    where a is the acceleration without it, of both masses together, and q the deflection. At one
+    coordinate of a mechanism the change of :math:`\ddot x` accelerates the others as a force there
+    does. The plant's response has a notch at f and a resonance at :math:`f/\sqrt{1 - \mu}`.
 
     Parameters
     ----------
@@ -404,11 +405,15 @@ class FlexibleMode(ForceEffect):
         omega = 2 * np.pi * self.frequency
         return omega * (omega * m.own["deflection"] + 2 * self.damping * m.own["speed"])
 
-    def force(self, m: Moment) -> Any:
-        """Return the change of the acceleration."""
+    def carry(self, m: Moment) -> Any:
+        """Return the change of the acceleration of the large mass."""
         return self.coupling * (m.acceleration + self.pull(m)) / (1 - self.coupling)
+
+    def force(self, m: Moment) -> Any:
+        """Return what changes the acceleration so."""
+        return m.find_force(self.carry(m))
 
     def rates(self, m: Moment) -> tuple[Any, ...]:
         """Return the rates of the deflection and of its speed."""
-        carried = m.acceleration + self.force(m)
+        carried = m.acceleration + self.carry(m)
         return m.own["speed"], -self.pull(m) - carried

@@ -30,7 +30,7 @@ class Range(Protocol):
 
     @property
     def duration(self) -> float:
-        """Length of the longest record [s]."""
+        """Length of the longest record [s]; stretches of one are as long as from first to last."""
 
     @property
     def travel(self) -> float:

@@ -210,7 +210,7 @@ class ParameterStep(LawEffect):
             low, high = max(times[best] - 2 * width, low), min(times[best] + 2 * width, high)
         size = float(sizes[best, 0]) / value if value else 0.0
         start = replace(self, time=float(times[best]), size=min(max(size, SMALLEST), LARGEST))
-        return Scan(((start,),), places=len(sight.times[0]))
+        return Scan(((start,),), places=round(last / sight.dt) + 1)
 
     def spread_starts(self, sight: Overview) -> tuple[Self, ...]:
         """Return a step at several instants of the record."""

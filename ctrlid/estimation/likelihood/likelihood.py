@@ -132,7 +132,9 @@ def make_problem(
     bounds = list_parameter_bounds(loop, names)
     start_times = start_times or [0.0] * len(records)
     data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, start_times, strict=True))
-    sees = find_sight(loop, records[0]) if can_follow_controller(loop, records[0]) else ""
+    # One record without a reference leaves the input between samples unknown in the filter of all.
+    followed = all(can_follow_controller(loop, one) for one in records)
+    sees = find_sight(loop, records[0]) if followed else ""
     plant = make_sampled_plant(
         loop, tuple(names), records[0].hold, sees, records[0].hold_r if sees else "zoh"
     )
