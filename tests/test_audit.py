@@ -496,3 +496,102 @@ def test_r_in_another_unit_than_y_is_remarked_upon(factor):
         # What does not follow r has no ratio to it.
         unlike = np.random.default_rng(1).standard_normal(record.n) / factor
         assert cid.audit(replace(record, y=unlike))["units"] == ()
+
+
+# --- angles and counters that start over
+
+
+def turning(amplitude=2.0):
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], 3.0 * u[0] - 2.0 * x[1]]), lambda t, x, u, p: x[0],
+        inputs=["V"], outputs=["phi"], states=["phi", "w"], name="axle",
+    )  # fmt: skip
+    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01)
+    r = cid.random_binary(1500, amplitude=amplitude, hold=150, around=2.0, seed=3)
+    return loop, cid.simulate(loop, r, sensor_noise=1e-3, seed=1)
+
+
+@pytest.mark.parametrize(
+    ("scale", "period", "words"),
+    [(1.0, 2 * np.pi, "2 pi, a turn in radians"), (180 / np.pi, 360.0, "360, a turn in degrees"),
+     (1e4, 65536.0, "65536, the range of a counter of 16 bits")],
+)  # fmt: skip
+def test_an_angle_that_starts_over_is_told_and_can_be_made_continuous(scale, period, words):
+    loop, record = turning()
+    y = scale * record.y
+    wrapped = replace(record, y=np.mod(y + period / 2, period) - period / 2)
+    (found,) = cid.audit(wrapped, loop)["wrapped"]
+    assert found.harmful
+    assert words in found.text
+    assert not cid.audit(wrapped, loop)["controller"]
+    again = np.unwrap(wrapped.y, period=period)
+    np.testing.assert_allclose(again, y, atol=1e-9 * period)
+    with pytest.raises(cid.CtrlidError, match=r"numpy.unwrap"):
+        cid.diagnose(loop, wrapped)
+
+
+JUMPS = {
+    "telegraph": lambda rng: rng.choice([-3.1, 3.1], 600),
+    "noise": lambda rng: 1.5 * rng.standard_normal(600).clip(-2, 2),
+    "walk": lambda rng: np.cumsum(rng.standard_normal(600)),
+    "bytes": lambda rng: 127.0 * np.sign(np.sin(np.arange(600) / 20)),
+    "steps": lambda rng: (
+        3.1 * np.sign(np.sin(np.arange(600) / 20)) + 0.01 * rng.standard_normal(600)
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", JUMPS)
+def test_jumps_of_other_kinds_are_no_turn(kind):
+    rng = np.random.default_rng(7)
+    record = cid.Record(u=rng.standard_normal(600), y=JUMPS[kind](rng), dt=0.01)
+    assert not cid.audit(record)["wrapped"]
+
+
+def test_each_of_several_outputs_may_start_over():
+    _loop, record = turning()
+    y = np.mod(record.y, 2 * np.pi)
+    both = cid.Record(u=record.u, y=[record.y, y], names={"y": ("phi", "psi")}, dt=0.01)
+    assert [f.channel for f in cid.audit(both)["wrapped"]] == ["psi"]
+
+
+# --- signals that repeat themselves
+
+
+@pytest.mark.parametrize("phases", ["random", "schroeder"])
+@pytest.mark.parametrize("period", [100, 200])
+def test_a_periodic_input_is_neither_limited_nor_quantized(phases, period):
+    """Each of its values comes as often as there are periods, the largest one too."""
+    u = cid.multisine(2000, amplitude=1.0, period=period, seed=1, phases=phases)
+    loop = cid.Loop(ct.tf([1], [1, 1]), None, dt=0.1)
+    record = cid.simulate(loop, d=u, sensor_noise=1e-2, seed=1)
+    assert not [f.kind for f in cid.audit(record).findings if f.channel == "u"]
+
+
+def test_a_periodic_input_that_is_limited_is_said_to_be():
+    u = cid.multisine(2000, amplitude=1.0, period=200, seed=1, phases="random").clip(-0.5, 0.6)
+    record = cid.Record(u=u, y=np.random.default_rng(0).standard_normal(2000), dt=0.1)
+    (found,) = cid.audit(record)["saturation"]
+    assert "-0.5 for 12 %" in found.text
+    coarse = replace(record, u=0.02 * np.round(u / 0.02))
+    assert cid.audit(coarse)["quantization"]
+
+
+# --- an operating point that contradicts its states
+
+
+def test_an_output_that_the_plant_does_not_show_at_its_states_is_told():
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    at = cid.operating_point(plant, output=0.012)
+    G = cid.linearize(plant, at)
+    law = cid.design_lead(G, crossover=100, phase_margin=50)
+    right, wrong = (cid.Loop(plant, law, dt=0.001, at=replace(at, output=y)) for y in (0.012, 0.12))
+    r = cid.random_binary(600, amplitude=1e-4, hold=20, around=0.012, seed=1)
+    record = cid.simulate(right, r, sensor_noise=1e-5, seed=2)
+    assert "ANOTHER" not in str(right)
+    assert "THE OUTPUT IS ANOTHER: at these states the plant shows x = 0.012" in str(wrong)
+    (found,) = cid.audit(record, wrong)["operating point"]
+    assert found.harmful
+    assert not cid.audit(record, right)["operating point"]
+    with pytest.raises(cid.CtrlidError, match=r"the plant shows x = 0.012"):
+        cid.redesign(G, wrong, crossover=100, phase_margin=50)

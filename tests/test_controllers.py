@@ -385,3 +385,41 @@ def test_magnetoshield_pid_leaves_white_dither(data_dir):
         assert dither.std() == pytest.approx(2 / np.sqrt(12), rel=0.12)
         lagged = np.corrcoef(dither[1:], dither[:-1])[0, 1]
         assert abs(lagged) < 0.1
+
+
+# --- inputs that have names
+
+
+SPRING = ct.ss([[0, 1], [-3, -2]], [[0], [1]], [[1, 0]], 0, inputs="V", outputs="x", name="st")
+
+
+def end_with(names, gains):
+    law = ct.ss([], [], [], [gains], inputs=names, outputs="V", name="C")
+    return cid.simulate(cid.Loop(SPRING, law, dt=0.01), np.ones(500)).y[-1]
+
+
+@pytest.mark.parametrize(
+    ("names", "gains"),
+    [
+        (["x", "r"], [-0.5, 0.5]), (["r", "x"], [0.5, -0.5]), (["x", "ref"], [-0.5, 0.5]),
+        (["ref", "x"], [0.5, -0.5]), (["y", "e"], [-0.5, 0.5]), (["r", "measured"], [0.5, -0.5]),
+        (["measured", "r"], [-0.5, 0.5]), (["y[0]", "w"], [-0.5, 0.5]),
+        (["u[0]", "u[1]"], [0.5, -0.5]),
+    ],
+)  # fmt: skip
+def test_the_input_with_the_name_of_the_output_is_the_output(names, gains):
+    """Read by position, a law of (x, r) had the wrong sign without a word."""
+    whole = ct.interconnect(
+        [SPRING, ct.ss([], [], [], [[-0.5, 0.5]], inputs=["x", "r"], outputs="V")],
+        inputs="r", outputs="x",
+    )  # fmt: skip
+    expected = ct.step_response(whole, np.arange(500) * 0.01).outputs[-1]
+    assert end_with(names, gains) == pytest.approx(expected, rel=1e-6)
+
+
+def test_names_that_do_not_say_which_input_is_the_output_are_refused():
+    with pytest.raises(CtrlidError, match=r"pv and sp, which does not say which .* output x"):
+        end_with(["pv", "sp"], [-0.5, 0.5])
+    with pytest.raises(CtrlidError, match=r"only input is called x, .* acts on r - y"):
+        end_with(["x"], [-0.5])
+    assert end_with(["e"], [0.5]) == pytest.approx(end_with(["r", "x"], [0.5, -0.5]))

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+import ctrlid as cid
 from ctrlid import CtrlidError, CtrlidWarning, Record
 
 WORDS = st.text(
@@ -410,3 +411,72 @@ def test_a_stored_record_is_scaled_by_the_names_of_its_signals(tmp_path):
     np.testing.assert_allclose(made.y, [[10, 20], [6, 8]])
     np.testing.assert_allclose(made.r, [10, 20])
     assert dict(made.names) == dict(record.names)
+
+
+# --- what tools of others write
+
+
+@pytest.mark.parametrize("german", [False, True])
+def test_points_and_commas_in_numbers_of_one_file_are_refused(tmp_path, german):
+    """Thousands that are parted by the sign of the decimals were a thousand times too small."""
+    rows = "".join(f"{k / 100:.2f};{k}.5;{990 + k:,}\n" for k in range(20))
+    if german:
+        rows = rows.translate(str.maketrans(".,", ",."))
+    path = tmp_path / "log.csv"
+    path.write_text("time;volt;pos\n" + rows)
+    with pytest.raises(CtrlidError, match="parts thousands") as refused:
+        cid.Record.from_csv(path, u="volt", y="pos")
+    assert "in line 12" in str(refused.value)
+    path.write_text("time;volt;pos\n" + rows.replace("1.0", "10").replace("1,0", "10"))
+    assert cid.Record.from_csv(path, u="volt", y="pos").y[-1] == 1009.0
+
+
+def test_a_stated_period_that_the_times_contradict_is_refused(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,u,y\n" + "".join(f"{k / 100:.2f},{k % 7},{k % 5}\n" for k in range(2000)))
+    with pytest.raises(CtrlidError, match=r"steps by 0.01 s, but dt is 0.0104 s"):
+        cid.Record.from_csv(path, dt=0.0104)
+    with pytest.warns(cid.CtrlidWarning, match=r"run over 19.99 s, .* over 20.03 s"):
+        assert cid.Record.from_csv(path, dt=0.01002).dt == 0.01002
+    assert cid.Record.from_csv(path, dt=0.01).dt == 0.01
+
+
+def test_times_in_whole_seconds_go_with_a_stated_period(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,u,y\n" + "".join(f"{k // 10},{k % 7},{k % 5}\n" for k in range(200)))
+    record = cid.Record.from_csv(path, dt=0.1)
+    assert (record.dt, len(record)) == (0.1, 200)
+
+
+def test_a_unit_in_brackets_needs_no_blank_before_it(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("Time(s),u(V),f(x),y(mm)\n" + "".join(f"{k / 10},1,{k},2\n" for k in range(9)))
+    record = cid.Record.from_csv(path, extra=["f(x)"])
+    assert (record.dt, record.units["u"], record.units["y"]) == (0.1, "V", "mm")
+    assert list(record.extra) == ["f(x)"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"PK\x03\x04\x14\x00", "is an Excel workbook"),
+        (b"t,u,y\n0,1,2\n,1,2\n0.2,1,3\n", "row 2 of the data has none"),
+        (b"t;u;y\n0;1.234,5;2\n1;1;2\n", "If its signs part thousands"),
+        (b"t,u,y\n0,1,2\n0.1,1,2\n0.2,1\n", "the last one may have been cut off"),
+    ],
+)  # fmt: skip
+def test_refusals_say_what_to_do(tmp_path, text, words):
+    path = tmp_path / "log.csv"
+    path.write_bytes(text)
+    with pytest.raises(CtrlidError, match=words):
+        cid.Record.from_csv(path)
+
+
+@pytest.mark.parametrize(("names", "spare"), [({"y": "pos"}, "pos"), ({}, "logged y")])
+def test_another_column_of_a_file_of_ours_takes_the_place_of_a_signal(tmp_path, names, spare):
+    one = cid.Record(u=[0, 1, 2], y=[1, 2, 3], extra={"i": [4, 5, 6]}, names=names, dt=1.0)
+    path = one.to_csv(tmp_path / "own.csv")
+    other = cid.Record.from_csv(tmp_path / "own.csv", y="i")
+    del path
+    assert (other.y.tolist(), other.names["y"]) == ([4, 5, 6], "i")
+    assert other.extra[spare].tolist() == [1, 2, 3]

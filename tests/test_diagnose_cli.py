@@ -7,6 +7,7 @@ import inspect
 import math
 import os
 import re
+import sys
 import warnings
 
 import control as ct
@@ -14,11 +15,13 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
+from ctrlid import CtrlidError
 from ctrlid import __main__ as command
 from ctrlid import effects as E
 from ctrlid.loop.controller_replay import run_controller
 from ctrlid.reporting.cli import arguments as _spoken
 from ctrlid.reporting.cli import diagnose_command as _command
+from ctrlid.reporting.cli.arguments import MergePairs, import_object, parse_assignments
 from ctrlid.reporting.cli.options import OPTIONS, name_options
 from problems import servo
 
@@ -438,3 +441,49 @@ def test_numbers_that_are_none():
     assert math.isinf(_spoken._parse_number("x", "inf"))
     with pytest.raises(cid.CtrlidError, match="x needs a number; given nan"):
         _spoken._parse_number("x", "nan")
+
+
+def test_a_model_file_is_run_as_python_runs_it(tmp_path, monkeypatch):
+    """It finds its neighbours, and its dataclasses their module."""
+    (tmp_path / "neighbour_of_rig.py").write_text("GAIN = 3.0\n")
+    (tmp_path / "rig_of_test.py").write_text(
+        "from __future__ import annotations\n"
+        "from dataclasses import dataclass\n"
+        "import control as ct\n"
+        "from neighbour_of_rig import GAIN\n"
+        "@dataclass\n"
+        "class Rig:\n    k: float = GAIN\n"
+        "servo = ct.tf([Rig().k], [1, 2, 0])\n"
+    )
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    found = import_object("--model", f"{tmp_path / 'rig_of_test.py'}:servo")
+    assert found.num[0][0][0] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x = (1\n", r"SyntaxError: '\(' was never closed \(line 1 of"),
+        ("import math\n1 / 0\n", r"ZeroDivisionError: division by zero \(line 2 of"),
+        ("import no_such_module\n", "That file imports it"),
+    ],
+)
+def test_what_is_wrong_in_a_model_file_is_told_in_one_line(tmp_path, monkeypatch, text, words):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "wrong_rig.py").write_text(text)
+    with pytest.raises(CtrlidError, match=words):
+        import_object("--model", f"{tmp_path / 'wrong_rig.py'}:rig")
+
+
+def test_names_with_blanks_are_names():
+    assert parse_assignments("Motor Voltage=mV") == {"Motor Voltage": "mV"}
+    assert parse_assignments("y=theta,alpha u=V") == {"y": ("theta", "alpha"), "u": "V"}
+    assert parse_assignments("a=1,b=2") == {"a": "1", "b": "2"}
+
+
+def test_columns_may_be_given_one_by_one():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--columns", type=parse_assignments, action=MergePairs, default={})
+    given = parser.parse_args(["--columns", "u=volt", "--columns", "y=pos"])
+    assert given.columns == {"u": "volt", "y": "pos"}
+    assert parser.parse_args([]).columns == {}

@@ -313,3 +313,15 @@ def test_a_single_output_may_stand_in_a_list():
         assert cid.operating_point(plant, output=given) == alone
     with pytest.raises(cid.CtrlidError, match="one for each output of"):
         cid.operating_point(plant, output=[0.01, 0.02])
+
+
+def test_a_plant_of_large_numbers_has_its_equilibrium():
+    """Pressures in Pa, below which of the air the equations have no value."""
+    tank = ct.nlsys(
+        lambda t, x, u, p: np.array([1e4 * u[0] - 100 * np.sqrt(x[0] - 101325.0)]),
+        lambda t, x, u, p: x[0], inputs=["q"], outputs=["p"], states=["p"], name="vessel",
+    )  # fmt: skip
+    at = cid.operating_point(tank, output=2e5)
+    assert at.states == pytest.approx((2e5,))
+    assert at.input == pytest.approx(0.01 * np.sqrt(2e5 - 101325.0))
+    assert str(cid.Loop(tank, None, dt=0.1, at=at)).startswith("Loop(vessel")

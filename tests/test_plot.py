@@ -494,3 +494,9 @@ def test_ticks_keep_apart(edges, ticks):
     ax = Figure().subplots()
     ax.set_xscale("symlog", linthresh=max(abs(edges[1]), abs(edges[-2])))
     assert findings._space_ticks(ax, np.array(edges)) == ticks
+
+
+def test_a_picture_is_saved_as_a_figure_is(tmp_path):
+    record = cid.Record(u=[0, 1, 0, 1], y=[0, 0, 1, 1], dt=0.1)
+    cid.plot.record(record).savefig(tmp_path / "record.png", dpi=40)
+    assert (tmp_path / "record.png").read_bytes().startswith(b"\x89PNG")

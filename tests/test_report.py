@@ -262,3 +262,15 @@ def test_table_rows_are_as_wide_as_the_head():
     with pytest.raises(cid.CtrlidError, match=r"needs 2 cells; given \('a',\)"):
         Table(("x", "y"), (("a",),))
     assert str(Table(("x", "y"), (("a", "10"),), "Title")) == "Title\nx    y\na   10"
+
+
+def test_an_audit_is_a_table_on_a_page(tmp_path):
+    u = np.repeat([0.0, 1.0, 0.0, 1.0], 50)
+    record = cid.Record(u=u, y=np.minimum(np.cumsum(u - 0.5), 12.0), dt=0.1)
+    found = cid.audit(record)
+    page = cid.write_report([record, found], tmp_path / "audit.html").read_text("utf-8")
+    assert "Audit of a record" in page
+    assert all(f.kind in page for f in found.findings)
+    clean = cid.Record(u=u, y=np.random.default_rng(1).standard_normal(200), dt=0.1, r=u)
+    made = cid.write_report(cid.audit(clean), tmp_path / "clean.html").read_text("utf-8")
+    assert "Audit of a record" in made

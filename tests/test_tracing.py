@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy import clip
 
+import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.physics.trace import trace
 
@@ -314,3 +315,10 @@ def test_structure_velocities_and_feedthrough():
     assert trace(lag()).velocities == ()
     assert not trace(servo()).feedthrough
     assert trace(ct.ss([[-1.0]], [[1.0]], [[1.0]], [[0.5]])).feedthrough
+
+
+def test_functions_without_params_are_told_their_arguments():
+    plant = ct.nlsys(lambda t, x, u: [u[0]], lambda t, x, u: x[0], inputs="V", outputs="x",
+                     states=["x"])  # fmt: skip
+    with pytest.raises(CtrlidError, match=r"take \(t, x, u, params\)"):
+        cid.Loop(plant, None, dt=0.01)

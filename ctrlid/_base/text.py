@@ -393,8 +393,8 @@ def split_unit(label: str) -> tuple[str, str]:
     Parameters
     ----------
     label : str
-        As in ``u [V]``, ``u[V]`` or ``u (V)``, or quantity over unit as in ``u/V`` (ISO 80000-1)
-        where what follows the slash is a unit; ``x[0]`` is an index, not a unit.
+        As in ``u [V]``, ``u[V]``, ``u (V)`` or ``u(V)``, or quantity over unit as in ``u/V`` (ISO
+        80000-1) where what follows the slash is a unit; ``x[0]`` is an index, not a unit.
 
     Returns
     -------
@@ -408,13 +408,15 @@ def split_unit(label: str) -> tuple[str, str]:
     >>> split_unit("Zeit/ms"), split_unit("speed/(m/s)"), split_unit("up/down")
     (('Zeit', 'ms'), ('speed', 'm/s'), ('up/down', ''))
     """
-    found = re.fullmatch(r"(.*\S)(\s*)\[([^\[\]]*)\]|(.*\S)(\s+)\(([^()]*)\)", label)
+    found = re.fullmatch(r"(.*\S)(\s*)\[([^\[\]]*)\]|(.*\S)(\s*)\(([^()]*)\)", label)
     if found is None:
         quantity, slash, unit = label.partition("/")
         if slash and quantity.strip() and is_unit(unit):
             return quantity.strip(), unit.strip().removeprefix("(").removesuffix(")")
         return label, ""
     name, space, unit = found.groups()[:3] if found[1] else found.groups()[3:]
+    if not found[1] and not space and not is_unit(unit):
+        return label, ""  # A function of something, as in f(x).
     return (name, unit) if space or not unit.isdigit() else (label, "")
 
 

@@ -17,8 +17,9 @@ from .csv_table import MARK, read_table, refuse_text, split_cells
 from .time_stamps import make_uniform, question_period
 
 TIME = ("t", "time", "timestamp", "seconds", "zeit")
-SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
-           "min": 60.0, "h": 3600.0}  # fmt: skip
+SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3,
+           "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "min": 60.0, "h": 3600.0}  # fmt: skip
+SIGNALS = ("r", "u", "y")
 # Sampling periods are shorter, so that times are finite [s].
 LONGEST = 1e12
 # So many rows are written at once, which bounds the memory that their text takes.
@@ -116,7 +117,14 @@ def read_csv(
         extra = [label for k, label in enumerate(names)
                  if k not in taken and label.partition(" ")[0] != "valid"]  # fmt: skip
         extra = extra if own else ()
-    further = {names[k]: k for k in (place(c, "extra") for c in extra)}
+        # A signal that another column takes the place of keeps its own name, or a new one.
+        spare = own.get("names", {})
+        further = {
+            _name_spare(names[k], spare) if names[k] in SIGNALS else names[k]: k
+            for k in (place(c, "extra") for c in extra)
+        }
+    else:
+        further = {names[k]: k for k in (place(c, "extra") for c in extra)}
     counting = [place("valid", "valid")] if "valid" in names else []
     each = [f"valid {name}" for name in columns["y"]]
     counted = len(each) > 1 and each[0] in names
@@ -158,7 +166,12 @@ def read_csv(
     at = {key: [found[key, i] for i in range(len(each))] for key, each in columns.items()}
     every = {**at, **{label: [k] for label, k in further.items()}}
     known = {key: tuple(names[k] for k in ks) for key, ks in at.items()}
-    called = own.get("names", {k: v for k, v in known.items() if v != (k,)})
+    # The names that a file of ours has are those of the signals in its own columns.
+    stored = {key: (key,) for key in SIGNALS} | {
+        key: (v,) if isinstance(v, str) else tuple(v) for key, v in own.get("columns", {}).items()
+    }
+    called = {key: v for key, v in own.get("names", {}).items() if known.get(key) == stored[key]}
+    called |= {key: v for key, v in known.items() if v != stored[key]}
     spoken = list_names(every, names, header, called)
     if renamed:
         own_words = list_names(at, names, header, called)
@@ -187,6 +200,13 @@ def read_csv(
         "hold_r": own.get("hold_r", "zoh"),
         "name": own.get("name", path.stem) if name is None else name,
     }  # fmt: skip
+
+
+def _name_spare(key: str, names: Mapping[str, Any]) -> str:
+    """Return what a signal of a file is called as a channel beside the one in its place."""
+    own = names.get(key, ())
+    own = (own,) if isinstance(own, str) else tuple(own)
+    return own[0] if len(own) == 1 and own[0] not in SIGNALS else f"logged {key}"
 
 
 def _find_column(path: Path, header: Sequence[str], label: str, what: str) -> int:

@@ -22,6 +22,9 @@ MARK = "# ctrlid "
 # The first line in which Excel is told the separator.
 SEPARATOR = "sep="
 CLOCK = re.compile(r"\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4}|\d{1,2}:\d\d")
+# How workbooks begin, new ones (a zip file) and old ones.
+WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
+THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[.,' ]\d{3})+(?:[.,]\d+)?")
 # So many bytes of a file show in what signs it is written.
 BEGINNING = 200
 
@@ -32,6 +35,11 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[str], Any, Texts, dict[
         data = path.read_bytes()
     except OSError as reason:
         raise CtrlidError(f"cannot read {path}: {reason.strerror}") from reason
+    if data.startswith(WORKBOOKS):
+        raise CtrlidError(
+            f"{path} is an Excel workbook and no text: save it as CSV, or read it with "
+            "pandas.read_excel and give the columns to Record(u=, y=, dt=)"
+        )
     text = _decode(data)
     own: dict[str, Any] = {}
     comment, told, at = "", "", 0
@@ -75,6 +83,8 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[str], Any, Texts, dict[
     body = text[stop:]
     if not body.strip():
         raise CtrlidError(f"{path} has no rows of numbers below its header")
+    if separator != ",":
+        _refuse_two_signs(path, body, separator, text.count("\n", 0, stop))
     # Where commas do not separate columns, they are decimal commas.
     plain = body if separator == "," else body.replace(",", ".")
     above, texts, dates = text.count("\n", 0, stop), Texts(), dict[int, Any]()
@@ -112,6 +122,24 @@ def _decode(data: bytes) -> str:
 def _is_empty(part: bytes) -> bool:
     """Whether nearly all bytes are zero, as every other one of a text in two bytes a sign."""
     return 10 * part.count(0) > 9 * len(part) > 0
+
+
+def _refuse_two_signs(path: Path, body: str, separator: str, above: int) -> None:
+    """Refuse numbers with points beside numbers with commas: one of them parts thousands."""
+    if "." not in body or "," not in body:
+        return
+    first: dict[str, str] = {}
+    for k, cells in enumerate(_read_cells(body, separator)):
+        for cell in cells:
+            for sign in ".,":
+                if sign in cell and sign not in first and _is_number(cell):
+                    first[sign] = f"{cell.strip()!r} in line {above + k + 1}"
+        if len(first) == 2:
+            raise CtrlidError(
+                f"{path} has numbers with points, such as {first['.']}, and numbers with commas, "
+                f"such as {first[',']}: one of the two signs parts thousands, and which of them "
+                "cannot be told. Save the file without it"
+            )
 
 
 def _refuse_decimal_commas(path: Path, row: str, separator: str, columns: int) -> None:
@@ -165,7 +193,8 @@ def _read_with_blanks(
                 _refuse_decimal_commas(path, lines[place], separator, columns)
             raise CtrlidError(f"{path} is not a table of numbers: line {above + k + 1} has "
                               f"{write_count(len(cells), 'cell')}, the lines above it "
-                              f"{len(rows[0])}")  # fmt: skip
+                              f"{len(rows[0])}. Complete the line or remove it; the last one may "
+                              "have been cut off")  # fmt: skip
     found = {column: read_seconds(cells) for column, cells in begun.items()}
     return np.array(rows), texts, {k: v for k, v in found.items() if v is not None}
 
@@ -191,8 +220,11 @@ def refuse_text(path: Path, texts: Texts, header: Sequence[str]) -> None:
             "it is a decimal comma, save the file with semicolons between columns, or with decimal "
             "points; if it parts thousands, save the file without it"
         )
+    cure = "Remove it"
+    if THOUSANDS.fullmatch(cell.strip()):
+        cure = "If its signs part thousands, save the file without them. Else remove it"
     raise CtrlidError(
-        f"{path} is not a table of numbers: {where}. Remove it, or leave the cell blank and give "
+        f"{path} is not a table of numbers: {where}. {cure}, or leave the cell blank and give "
         "gaps='mask'; lines above the header or a row of units: delete them or start them with #"
     )
 

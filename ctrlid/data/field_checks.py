@@ -33,7 +33,11 @@ def check_samples(name: str, values: Any, several: bool = False) -> Any:
     except ValueError as reason:
         raise CtrlidError(f"{name} must be one array of numbers: {reason}") from reason
     if array.dtype.kind not in "fiub":
-        raise CtrlidError(f"{name} must be an array of real numbers; given {array.dtype} data")
+        raise CtrlidError(
+            f"{name} must be an array of real numbers; given {array.dtype} data. Make numbers of "
+            "them, for instance by pandas.to_numeric(column, errors='coerce'), and mark what is "
+            "missing by valid="
+        )
     if several and array.ndim == 2:
         if not 0 < array.shape[0] <= array.shape[1]:
             raise CtrlidError(

@@ -18,11 +18,11 @@ from .._base.signals import list_signals, require_one_signal
 from .._base.text import Printed, list_known, write_count, write_percent, write_time
 from . import csv_files as _csv
 from . import responses as _response
+from .csv_files import SIGNALS as SIGNALS
 from .field_checks import check_samples, check_seconds, check_words
 from .validity import find_runs, find_whole_past
 
 Hold = Literal["zoh", "foh", "bandlimited"]
-SIGNALS = ("r", "u", "y")
 # Columns of a CSV file have these names, so that no extra channel may.
 RESERVED = (*SIGNALS, "t", "time", "valid")
 
@@ -411,10 +411,12 @@ class Record(Printed):
             around = np.pad(s - s[0], half, mode="reflect", reflect_type="odd")
             return s[0] + signal.fftconvolve(around, taps, "valid")[::q]
 
+        # What was held is smooth afterwards, the reference as well.
         hold = "foh" if self.hold == "zoh" else self.hold
         return self._change_channels(
-            lambda s: np.apply_along_axis(filtered, -1, s), valid=valid, dt=self.dt * q, hold=hold
-        )
+            lambda s: np.apply_along_axis(filtered, -1, s), valid=valid, dt=self.dt * q, hold=hold,
+            hold_r="foh",
+        )  # fmt: skip
 
     def with_input(self, channel: str) -> "Record":
         """Return the record with an extra channel as input; the old input becomes an extra one.

@@ -14,6 +14,8 @@ from .._base.text import drop_roundoff, write_count, write_percent
 WILD = 100
 # A good clock never jitters by more than this share of the period.
 JITTER = 0.01
+# A clock is right to this share; beyond it the times of a log and its stated period contradict.
+CLOCK = 0.01
 # A step of more periods between two time stamps says that samples are missing.
 GAP = 1.5
 # Where steps of two units come less often than this, rows may have been lost at a regular pace. A
@@ -23,8 +25,11 @@ LOST = 0.2
 
 def make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[float, Any]:
     """Return the period of time stamps and, for each uniform sample, its row."""
-    if len(stamps) < 2 or not np.isfinite(stamps).all():
-        raise CtrlidError(f"the time column of {path} needs at least 2 values, all finite")
+    lost = np.flatnonzero(~np.isfinite(stamps))
+    if len(stamps) < 2 or lost.size:
+        here = f"; row {lost[0] + 1} of the data has none" if lost.size else ""
+        raise CtrlidError(f"the time column of {path} needs at least 2 values, all finite{here}. "
+                          "Complete it, or remove the column and give dt=")  # fmt: skip
     rounding, period_is_free = _find_resolution(stamps), dt is None
     even = _find_even_period(stamps, rounding, dt)
     if even is not None and dt is None and (unit := _find_doubled_unit(stamps)) is not None:
@@ -53,15 +58,23 @@ def make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[
         raise CtrlidError(
             f"the time column of {path} does not increase: {stamps[k]:g} s in row {k + 1} of the "
             f"data is followed by {stamps[k + 1]:g} s. Sort the rows, cut at the restart of the "
-            "clock, or give dt= and remove the column"
+            "clock, or remove the column and give dt="
         )
     regular = steps[steps < GAP * np.median(steps)]
     # Round-off of the stamps is no digit of the period, also where rows are lost.
     usual = drop_roundoff(float(np.mean(regular)), 4 * float(np.spacing(np.abs(stamps).max())))
-    if dt is not None and not abs(usual - dt) < 0.05 * usual:
+    unsure = CLOCK * usual + 8 * float(np.spacing(np.abs(stamps).max())) / (len(stamps) - 1)
+    if dt is not None and not abs(usual - dt) < unsure:
         raise CtrlidError(f"the time column of {path} steps by {usual:.4g} s, but dt is {dt:g} s. "
                           "Leave out dt=, or remove the column; if its times are in another unit, "
                           "write it into the header, as in 't [ms]'")  # fmt: skip
+    ends = len(stamps) * abs(usual - dt) if dt is not None else 0.0
+    if dt is not None and len(regular) == len(steps) and ends > max(dt, 1.5 * rounding):
+        warnings.warn(
+            f"the times of {path} run over {stamps[-1] - stamps[0]:.6g} s, the samples with "
+            f"dt={dt:.10g} over {(len(stamps) - 1) * dt:.6g} s. dt= is believed",
+            CtrlidWarning, stacklevel=4,
+        )  # fmt: skip
     if dt is None:
         dt = _estimate_period(stamps) if len(regular) == len(steps) else usual
     lost = np.round(steps / dt) - 1
@@ -90,7 +103,8 @@ def make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[
             dt = _shorten_period(dt, 2 * jitter * dt / (len(stamps) - 1))
         warnings.warn(
             f"the times of {path} jitter by up to {write_percent(jitter)} of the period "
-            f"{dt:.10g} s; they are taken as uniform. Give dt= if the clock has another period. If "
+            f"{dt:.10g} s; they are taken as uniform. "
+            f"{'Give dt= if the clock has another period. ' if period_is_free else ''}If "
             "the samples really were taken unevenly, resample them at even times first, as with "
             "numpy.interp",
             CtrlidWarning, stacklevel=4,
@@ -145,6 +159,9 @@ def _find_even_period(stamps: Any, rounding: float, dt: float | None) -> float |
         return _estimate_period(stamps)
     steps = np.diff(stamps)
     base = float(np.median(steps)) if dt is None else dt
+    if dt is not None and rounding > dt:
+        # Times in whole seconds of samples that are taken ten times a second.
+        return dt if fits(dt, 1.25) else None
     if not rounding <= mean or base <= 0:
         return None
     # Steps of 1, 1 and 2 units may also be lost samples, unless there are many, evenly spread.

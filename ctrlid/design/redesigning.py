@@ -351,6 +351,12 @@ def redesign(
     if not isinstance(loop, Loop):
         raise CtrlidError("redesign needs a Loop, on which the controller is tried; given "
                           f"{type(loop).__name__}{point_at_part(loop, Loop)}")  # fmt: skip
+    other = loop.describe_other_output()
+    if other:
+        # The controller would be tried about another point than that which it was designed for.
+        given = ", ".join(f"{y:.4g}" for y in loop.point.outputs)
+        raise CtrlidError(f"the output of the loop's operating point is {given}, but {other}. Give "
+                          "the loop at=operating_point(plant, output=...)")  # fmt: skip
     if isinstance(design, ct.InputOutputSystem):
         # A transfer function can be called too, with a frequency.
         raise CtrlidError(

@@ -24,7 +24,7 @@ from ..physics.linearization import OperatingPoint
 from ..validation.record_audit import Audit, AuditFinding, audit
 from .thresholds import THRESHOLD
 
-HOPELESS = ("too few samples", "constant signal", "operating point", "sampled")
+HOPELESS = ("too few samples", "constant signal", "operating point", "sampled", "wrapped")
 
 
 def make_loop(loop: Any, record: Record) -> Loop:

@@ -149,7 +149,9 @@ class ControlLaw:
     reads_input: bool = False
 
 
-def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlLaw:
+def make_control_law(
+    controller: Any, at: OperatingPoint, dt: float, output: str = "y"
+) -> ControlLaw:
     """Return the law of a controller in absolute physical units.
 
     A linear controller of one input acts as ``u = at.input + C(r - y)``, one of two inputs as
@@ -164,6 +166,8 @@ def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlL
         Operating point of the loop.
     dt : float
         Sampling period of the loop [s].
+    output : str, optional
+        What the plant calls its output.
 
     Returns
     -------
@@ -174,7 +178,7 @@ def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlL
     ------
     CtrlidError
         If the controller has another number of inputs or outputs, another sampling period than the
-        loop, or is improper.
+        loop, or is improper; if the names of its inputs do not say which of them is y.
     """
     if isinstance(controller, PID):
         return _make_pid_law(controller, at, dt)
@@ -196,8 +200,7 @@ def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlL
     if sampled and not have_same_period(sampled, dt):
         both = write_both_periods("the controller runs", sampled, "the loop", dt)
         raise CtrlidError(f"{both}; convert it to the period of the loop")
-    swap = controller.ninputs == 2 and list(controller.input_labels) == ["y", "r"]
-    order = (1, 0) if swap else (0, 1)
+    order = _find_input_order(list(controller.input_labels), output)
     if isinstance(controller, ct.TransferFunction | ct.StateSpace):
         if isinstance(controller, ct.TransferFunction):
             require_proper(controller)
@@ -205,6 +208,31 @@ def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlL
         b, d = (m[:, order] if controller.ninputs == 2 else m for m in (b, d))
         return _make_linear_law(a, b, c, d, at, dt if sampled else 0.0)
     return _make_traced_law(controller, at, dt if sampled else 0.0, order)
+
+
+def _find_input_order(names: list[str], output: str) -> tuple[int, int]:
+    """Return where (r, y) are among a controller's inputs, as the names of these say.
+
+    Without names the reference comes first.
+    """
+    measured = [name in (output, "y", "y[0]") for name in names]
+    if len(names) == 1:
+        if measured[0] and output != "e":
+            raise CtrlidError(
+                f"the controller's only input is called {names[0]}, as the output of the plant, "
+                "but a controller with one input acts on r - y. Call it e if it does; a law "
+                f"u = C(y) has two inputs, r and {output}, and does nothing with r"
+            )
+        return 0, 1
+    known = names == ["u[0]", "u[1]"] or "r" in names or sum(measured) == 1
+    if not known:
+        raise CtrlidError(
+            f"the controller's inputs are called {names[0]} and {names[1]}, which does not say "
+            f"which of them is the plant's output {output} and which the reference: call them r "
+            f"and {output}, in any order"
+        )
+    first = measured[0] and not measured[1] if sum(measured) == 1 else names[1] == "r"
+    return (1, 0) if first else (0, 1)
 
 
 def require_proper(controller: Any) -> None:

@@ -41,6 +41,9 @@ from .loop_arguments import (
 from .velocities import describe_missing_forces, list_unforced_velocities
 from .wiring import Wiring, is_wired_by_name, make_wired_law, make_wiring
 
+# The output of an operating point is another than the plant's by more than this share.
+OTHER_OUTPUT = 0.05
+
 
 @explain_fields
 @dataclass(frozen=True, eq=False, repr=False)
@@ -463,7 +466,7 @@ class Loop(Printed):
         if known is None:
             wiring = self.wiring
             if wiring is None:
-                known = make_control_law(self.controller, self.at, self.dt)
+                known = make_control_law(self.controller, self.at, self.dt, self._traced.outputs[0])
             else:
                 known = make_wired_law(self.controller, wiring, self.at, self.dt)
             object.__setattr__(self, "_law", known)
@@ -551,7 +554,8 @@ class Loop(Printed):
         pairs = zip((*e.outputs, *e.inputs), (*self.at.outputs, *self.at.inputs), strict=True)
         point = ", ".join(f"{name} = {value:g}" for name, value in pairs)
         text = f"Loop({e.name}, {kind}, dt={self.dt:g} s, at {point}"
-        text += self._describe_imbalance()
+        other = self.describe_other_output()
+        text += f" (THE OUTPUT IS ANOTHER: {other})" if other else self._describe_imbalance()
         limits = np.broadcast_to(np.array(np.broadcast_arrays(*self.input_limits)).T,
                                  (len(e.inputs), 2))  # fmt: skip
         for name, (low, high) in zip(e.inputs, limits, strict=True):
@@ -578,6 +582,24 @@ class Loop(Printed):
         if not list_unforced_velocities(e):
             return write_loop(self)
         return f"{write_loop(self)}\n  note: {describe_missing_forces(e, self.point)}."
+
+    def describe_other_output(self) -> str:
+        """Say what the plant shows at the states of the operating point, if not the output there.
+
+        Empty where both agree. The parameters of a sensor, which a fit may change, are a reason why
+        they need not agree exactly.
+        """
+        if self.linear_plant:
+            return ""
+        at, e = self._bare_point, self._traced
+        shown = e.evaluate(np.array(at.states), np.array(at.inputs))[1]
+        small = 1e-9 * max(map(abs, (*at.states, *at.inputs)), default=0.0)
+        others = [
+            f"{name} = {there:g}"
+            for name, given, there in zip(e.outputs, at.outputs, shown.tolist(), strict=True)
+            if abs(given - there) > OTHER_OUTPUT * max(abs(given), abs(there)) + small
+        ]
+        return f"at these states the plant shows {', '.join(others)}" if others else ""
 
     def _describe_imbalance(self) -> str:
         """Say that the plant does not rest at the operating point; empty where it does.

@@ -58,7 +58,8 @@ def check_free(given: Any, e: Equations) -> tuple[str, ...] | dict[str, float]:
     if unknown:
         raise CtrlidError(
             f"free= names {unknown}, but the numeric parameters of {e.name} are "
-            f"{list(e.parameters)}; give parameters to ct.nlsys with params={{...}}"
+            f"{list(e.parameters)}; give parameters to ct.nlsys with params={{...}}, each of them "
+            "one number: an array cannot be free"
         )
     if not isinstance(free, dict):
         return tuple(dict.fromkeys(free))

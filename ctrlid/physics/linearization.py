@@ -1,5 +1,6 @@
 """Operating points and exact linear models of a plant."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,8 @@ UNBALANCED = 0.05
 NOT_AT_ALL = 0.9
 # The search for equilibria starts from so many random points.
 STARTS = 60
+# As large as a state is sought, where nothing is found nearer.
+FARTHEST = 1e8
 
 WANTED = "an operating point is given by numbers: states=(...), input=, output=, which"
 
@@ -240,7 +243,12 @@ def operating_point(
     repeats = 0
     closest: tuple[float, Array] | None = None
     inputs = len(equations.inputs)
-    for trial, start in enumerate(_draw_starts(n, target if one else [0.0], guess, inputs)):
+    starts = _draw_starts(n, target if one else [0.0], guess, inputs)
+    far = len(starts) - STARTS
+    for trial, start in enumerate(starts):
+        if found and trial >= far:
+            # Far starts are for plants of large numbers, such as pressures in Pa.
+            break
         solution, error = _solve_equilibrium(evaluate, start, damped=trial % 3 == 2)
         if solution is None:
             continue
@@ -251,7 +259,7 @@ def operating_point(
             # With a guess the first equilibrium is the wanted one, since the starts begin with it.
             if guess is not None or repeats >= 15:
                 break
-        elif closest is None or error < closest[0]:
+        elif trial < far and (closest is None or error < closest[0]):
             closest = (error, solution)
     if not found:
         hint = ""
@@ -267,10 +275,10 @@ def operating_point(
             f"{name} = {value:g}" for name, value in zip(equations.outputs, target, strict=True)
         )
         raise ModelCannotRun(
-            f"{equations.name} has no equilibrium with {wanted}: from {STARTS} starting points no "
-            f"states and input {', '.join(equations.inputs)} were found that "
-            f"hold it there.{hint} Choose an output inside the range of the plant, or give guess= "
-            "near an equilibrium"
+            f"{equations.name} has no equilibrium with {wanted}: from {len(starts)} starting "
+            f"points, with states of up to {FARTHEST:g}, no states and input "
+            f"{', '.join(equations.inputs)} were found that hold it there.{hint} Choose an output "
+            "inside the range of the plant, or give guess= near an equilibrium"
         )
     if inputs == 1:
         best = min(found, key=lambda s: (s[n] < -1e-12 * abs(s).max(), abs(s[n])))
@@ -304,8 +312,9 @@ def _draw_starts(n: int, target: Sequence[float], guess: Any, inputs: int = 1) -
             raise CtrlidError(f"guess needs {write_count(n, 'state')}; given {states.size}")
         sizes = [s * 10.0**k for k in range(-2, 3) for s in (1, -1)]
         starts += [np.append(states, [size] * inputs) for size in sizes]
-    for trial in range(STARTS):
-        size = 10.0 ** rng.uniform(-3, 2, n + inputs)
+    for trial in range(2 * STARTS):
+        most = 2.0 if trial < STARTS else math.log10(FARTHEST)
+        size = 10.0 ** rng.uniform(-3, most, n + inputs)
         start = rng.choice([-1.0, 1.0], n + inputs) * size
         # The output is often a state, and the other states are often at rest.
         start[:n] = np.where(rng.random(n) < 0.6, target[0], start[:n])

@@ -241,6 +241,10 @@ def _explain_failure(system: Any, reason: Exception) -> str:
             f"it asks for the parameter {reason}, which the system does not have: give "
             f"params={{{reason}: value}} to ct.nlsys (it has {list(system.params)})"
         )
+    elif isinstance(reason, TypeError) and not user:
+        # No line of the user's functions ran: it is their arguments.
+        cure = (f"{type(reason).__name__}: {reason}. The functions of ct.nlsys take (t, x, u, "
+                "params), the parameters even where there are none")  # fmt: skip
     elif not isinstance(reason, CtrlidError):
         cure = (f"{type(reason).__name__}: {reason}. Write the equations with arithmetic and numpy "
                 "functions of the states, np.where for cases and np.interp for tables")  # fmt: skip
@@ -252,12 +256,13 @@ def _check_equations(system: Any, equations: Equations) -> Equations:
     rng = np.random.default_rng(20090317)
     n, m = len(equations.states), len(equations.inputs)
     found, failure = 0, ""
-    for trial in range(6 * CHECKS):
-        if found >= CHECKS:
+    for trial in range(12 * CHECKS):
+        if found >= CHECKS or (found and trial >= 6 * CHECKS):
             break
         # From micrometres to kilometres, both signs and positive only: a plant is rarely defined
         # everywhere, and a wrong branch rarely shows at one scale.
-        size = 10.0 ** rng.uniform(-4, 3, n + m + 1)
+        # Some have no value but at large numbers, such as temperatures in K and pressures in Pa.
+        size = 10.0 ** rng.uniform(-4, 3 if trial < 6 * CHECKS else 8, n + m + 1)
         z = rng.standard_normal(n + m + 1) * size
         z = np.abs(z) if trial % 2 else z
         x, u, t = z[:n], z[n : n + m], abs(z[-1])
@@ -287,8 +292,10 @@ def _check_equations(system: Any, equations: Equations) -> Equations:
     if not found:
         raise TracingError(
             f"the Python function of {system.name} gave no finite value at {6 * CHECKS} random "
-            f"points{failure}, so the traced equations cannot be checked; make sure that it works "
-            "for states between 1e-4 and 1e3"
+            f"points, nor at as many with larger numbers{failure}, so the traced equations cannot "
+            "be checked; make sure that its parameters are finite, and that it has a value for "
+            "states of some size between 1e-4 and 1e8, for instance by np.maximum(..., 0) below a "
+            "root"
         )
     return equations
 

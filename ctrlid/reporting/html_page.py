@@ -121,7 +121,7 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
 
     Parameters
     ----------
-    result : Record, IdentifiedModel, LoopFit, Comparison, Redesign, Diagnosis or Section
+    result : Record, Audit, IdentifiedModel, LoopFit, Comparison, Redesign, Diagnosis or Section
         What to report (all that a `Section` takes), or several of them in a sequence.
     path : str or Path
         The file; one that exists is replaced.

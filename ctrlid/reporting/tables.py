@@ -17,6 +17,7 @@ from ..estimation.identified_model import Estimate, IdentifiedModel, IdentifiedS
 from ..estimation.likelihood.physics_estimate import LoopFit
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison, write_fit
+from ..validation.record_audit import Audit
 
 # What u does between the samples, by the record's hold.
 BETWEEN = {
@@ -97,6 +98,8 @@ def write_heading(result: Any) -> str:
     match result:
         case Record():
             return f"Record {result.name}".strip()
+        case Audit():
+            return "Audit of a record"
         case IdentifiedModel():
             return f"Model by {result.estimate.method}"
         case IdentifiedSystem():
@@ -112,7 +115,7 @@ def write_heading(result: Any) -> str:
         case Table():
             return result.caption or "Table"
     raise CtrlidError(
-        "a report shows a Record, IdentifiedModel, IdentifiedSystem, LoopFit, Comparison, "
+        "a report shows a Record, Audit, IdentifiedModel, IdentifiedSystem, LoopFit, Comparison, "
         "Redesign, ControllerTrial, Diagnosis, Table or Section, or a sequence of them; given "
         f"{type(result).__name__}"
     )
@@ -125,6 +128,8 @@ def make_blocks(result: Any) -> list[Block]:
             return [result]
         case Record():
             return [_make_record_table(result)]
+        case Audit():
+            return _make_audit_blocks(result)
         case IdentifiedModel():
             return _make_estimate_blocks(result.estimate)
         case IdentifiedSystem():
@@ -163,6 +168,13 @@ def _make_record_table(record: Record) -> Table:
     )
     head = ("signal", "unit", "smallest", "mean", "largest", "standard deviation")
     return Table(head, rows, caption)
+
+
+def _make_audit_blocks(found: Audit) -> list[Block]:
+    if not found.findings:
+        return ["No defect was found in this record."]
+    rows = tuple((f.kind, f.channel, "yes" if f.harmful else "no", f.text) for f in found.findings)
+    return [Table(("finding", "channel", "harms a fit", "what it is"), rows)]
 
 
 def _make_estimate_blocks(e: Estimate) -> list[Block]:

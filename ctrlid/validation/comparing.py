@@ -139,6 +139,7 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
         f"{type(model_or_loop).__name__}"
         + (
             point_at_part(model_or_loop, Loop)
+            or (". Give control.tf(model)" if isinstance(model_or_loop, ct.StateSpace) else "")
             or ". Put a nonlinear plant into a Loop(plant, controller, dt=..., at=...)"
         )
     )

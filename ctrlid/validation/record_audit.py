@@ -1,6 +1,7 @@
 """audit(): defects of a record, found before anything is fitted to it."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -215,6 +216,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     findings = [
         *checks.check_length(),
         *checks.find_constant(),
+        *checks.find_wraps(),
         *checks.find_limits(),
         *checks.find_steps(),
         *checks.find_gaps(),
@@ -233,7 +235,9 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
         findings += checks.check_operating_point(loop)
         shifted = _list_unchecked_law(loop, record)
         findings += shifted
-        for kind, text, size, harmful in () if shifted else check_controller(loop, record):
+        # A law reads the jumps of an angle that starts over as errors.
+        unclear = shifted or any(f.kind == "wrapped" for f in findings)
+        for kind, text, size, harmful in () if unclear else check_controller(loop, record):
             injected = injected or kind == "injected"
             named = kind if kind in FAULTS else "controller"
             findings.append(AuditFinding(named, "u", text, size, checks.whole, harmful))
@@ -279,7 +283,7 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
         found = [*checks.check_length(), *checks.find_constant(), *checks.find_limits(),
                  *checks.find_steps()]  # fmt: skip
         if key == "y":
-            found += [*checks.find_gaps(), *checks.find_outliers()]
+            found += [*checks.find_wraps(), *checks.find_gaps(), *checks.find_outliers()]
         elif key == "r" and len(periods) == 1:
             found += checks.find_repetition()
         # A reference may have the name of the output that follows it.
@@ -329,8 +333,13 @@ class _RecordChecks:
         self.references = references
         self.signals = {k: v for k in SIGNALS if (v := getattr(record, k)) is not None}
         self.whole = (0, record.n)
+        # What is exactly periodic has each value as often as there are periods.
+        self.period = {
+            k: defects.find_exact_period(v) if self.valid.all() else 0
+            for k, v in self.signals.items()
+        }
         self.quantum = dict.fromkeys(SIGNALS, 0.0) | {
-            k: find_grid_step(v[self.valid])
+            k: find_grid_step(v[self.valid][: self.period[k] or None])
             for k, v in self.signals.items()
             if k == "y" or not defects.is_held(v[self.valid])
         }
@@ -385,6 +394,8 @@ class _RecordChecks:
         for key in ("u", "y"):
             v = self.signals[key]
             others = [s for k, s in self.signals.items() if k != key]
+            if self.period[key] and not self._is_clipped(key, others, slice(self.period[key])):
+                continue
             shares, values, mask = [], [], np.zeros(len(v), dtype=bool)
             for side in (-1, 1):
                 at, limit = defects.find_clipped(v, self.valid, others, self.quantum[key], side,
@@ -419,6 +430,31 @@ class _RecordChecks:
                                     float(np.mean(mask[self.valid])),
                                     (int(where[0]), int(where[-1]) + 1), key == "y"))  # fmt: skip
         return out
+
+    def _is_clipped(self, key: str, others: Sequence[Array], part: slice) -> bool:
+        """Whether a signal sits on one of its extreme values within a part of the record."""
+        v, valid = self.signals[key][part], self.valid[part]
+        rest, step = [s[part] for s in others], self.quantum[key]
+        sides = (defects.find_clipped(v, valid, rest, step, side)[0] for side in (-1, 1))
+        return any(at.any() for at in sides)
+
+    def find_wraps(self) -> list[AuditFinding]:
+        """Say where an angle or a counter starts over."""
+        period, at = defects.find_wraps(self.record.y, self.valid)
+        if not period:
+            return []
+        name = self.names["y"]
+        size = "2 * numpy.pi" if period == 2 * math.pi else f"{period:.0f}"
+        what = {2 * math.pi: "2 pi, a turn in radians", 360.0: "360, a turn in degrees"}.get(
+            period, f"{size}, the range of a counter of {math.log2(period):.0f} bits"
+        )
+        text = (
+            f"{name} jumps by {what}, at {write_count(len(at), 'sample')}, the first of them "
+            f"{at[0]}, and goes on as if it had not: it starts over at the end of its range, and "
+            "the plant does not. Make it continuous, for instance by dataclasses.replace(record, "
+            f"y=numpy.unwrap(record.y, period={size}))."
+        )
+        return [AuditFinding("wrapped", "y", text, len(at), (int(at[0]), int(at[-1]) + 1), True)]
 
     def find_steps(self) -> list[AuditFinding]:
         out = []
@@ -527,6 +563,14 @@ class _RecordChecks:
         return max(self.record.segments(), key=lambda ends: ends[1] - ends[0])
 
     def check_operating_point(self, loop: Loop) -> list[AuditFinding]:
+        other = loop.describe_other_output()
+        if other:
+            text = (
+                f"the output of the loop's operating point is {loop.point.output:.4g}, but "
+                f"{other}. Give at=operating_point(plant, output=...), or the states that belong "
+                "to the output."
+            )
+            return [AuditFinding("operating point", "y", text, 1.0, self.whole, harmful=True)]
         ratio = measure_distance(loop, self.record)
         if not ratio:
             return []

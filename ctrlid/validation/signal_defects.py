@@ -4,6 +4,7 @@ Arrays in, numbers out. The bounds are laws of chance for a signal of this lengt
 signal's own size; none is in physical units.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,6 +29,8 @@ REPEATED_SHARE = 1e-3
 BLOCKS = 40
 # So many samples tell how large a drift is; of longer records every k-th is used.
 PLENTY = 100_000
+# Where angles start over [rad, deg], and counters of 8 to 32 bits.
+TURNS = (2 * math.pi, 360.0, *(2.0**bits for bits in (8, 10, 12, 14, 16, 24, 32)))
 
 
 def is_held(v: Array) -> bool:
@@ -115,6 +118,49 @@ def find_clipped(
     least = SOME if len(find_runs(at)[0]) > 1 else 2 * SOME
     enough = np.count_nonzero(at) >= least + SOME * max(usual, 0.0)
     return (at if enough else none), side * limit
+
+
+def find_wraps(v: Array, valid: Any) -> tuple[float, Any]:
+    r"""Return the range at whose ends a signal starts over, and the samples at which it does, or 0.
+
+    .. math:: |\Delta v_k| > P/2, \quad |\Delta v_k \mp P| \le 2 \max_{others} |\Delta v|
+
+    for a turn in radians or degrees, or the range of a counter of 8 to 32 bits, within which the
+    whole signal lies: an angle or a count that goes on where it seems to jump.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+        Signal.
+    valid : ndarray of bool, shape (n,)
+        Samples that count.
+
+    Returns
+    -------
+    period : float
+        The range [signal unit]; 0 for a signal that does not start over.
+    at : ndarray of int
+        The samples right after.
+    """
+    step = np.where(valid[1:] & valid[:-1], np.diff(v), 0.0)
+    reach = float(np.ptp(v[valid]))
+    for period in TURNS:
+        far = np.abs(step) > period / 2
+        if not far.any() or reach > period or reach < 0.9 * period:
+            continue
+        usual = float(np.max(np.abs(step[~far]), initial=0.0))
+        if np.max(np.abs(np.abs(step[far]) - period)) <= 2 * usual < period / 2:
+            return period, np.flatnonzero(far) + 1
+    return 0.0, np.zeros(0, dtype=int)
+
+
+def find_exact_period(v: Array) -> int:
+    """Return after how many samples a signal repeats itself to rounding, or 0."""
+    period = find_period(v)
+    if not period:
+        return 0
+    same = np.abs(v[period:] - v[:-period]) <= 4 * estimate_rounding(v)
+    return period if same.all() else 0
 
 
 def is_one_event(v: Array, at: Any, references: Sequence[Array], step: float) -> bool:

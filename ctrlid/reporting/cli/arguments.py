@@ -9,6 +9,7 @@ import math
 import os
 import re
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -147,15 +148,30 @@ def import_object(option: str, text: str) -> Any:
             assert spec is not None
             assert spec.loader is not None
             found = importlib.util.module_from_spec(spec)
+            # As if the file were run: it finds its neighbours, and dataclasses their module.
+            sys.modules[spec.name] = found
+            sys.path.insert(0, str(Path(module).resolve().parent))
             spec.loader.exec_module(found)
         else:
             if not {"", os.getcwd()} & set(sys.path):
                 sys.path.insert(0, os.getcwd())
             found = importlib.import_module(module)
     except (ModuleNotFoundError, FileNotFoundError) as reason:
+        here = module.endswith(".py") and Path(module).exists()
+        cure = "Give a file, as in plant.py:ball, or a module that Python finds from here"
+        cure = "That file imports it: install it, or put it beside the file" if here else cure
         raise CtrlidError(
-            f"{option} {text}: {module} cannot be imported: {reason}. Give a file, as in "
-            "plant.py:ball, or a module that Python finds from here"
+            f"{option} {text}: {module} cannot be imported: {reason}. {cure}"
+        ) from reason
+    except Exception as reason:
+        # What a user's file does wrong is told in one line, with its place.
+        place = traceback.extract_tb(reason.__traceback__)[-1]
+        words, file, line = str(reason), place.filename, place.lineno
+        if isinstance(reason, SyntaxError):
+            words, file, line = reason.msg, reason.filename or module, reason.lineno
+        raise CtrlidError(
+            f"{option} {text}: {module} cannot be run: {type(reason).__name__}: {words} (line "
+            f"{line} of {file}). Run it by itself, python {module}, until it does"
         ) from reason
     if not hasattr(found, name):
         systems = [k for k, v in vars(found).items() if isinstance(v, (Loop, *SYSTEMS))]
@@ -193,7 +209,12 @@ def parse_assignment(text: str) -> tuple[str, float]:
 
 def parse_assignments(text: str) -> dict[str, str | tuple[str, ...]]:
     """Read NAME=VALUE,NAME=VALUE, or NAME=VALUE,VALUE NAME=VALUE where a name has several."""
-    pairs = [part.partition("=") for part in NEXT_NAME.split(text) if part.strip()]
+    parts: list[str] = []
+    for part in filter(str.strip, NEXT_NAME.split(text)):
+        # A name may have blanks in it: what stands before its last word is no pair yet.
+        whole = parts and "=" not in parts[-1]
+        parts[-1:] = [f"{parts[-1]} {part}"] if whole else [*parts[-1:], part]
+    pairs = [part.partition("=") for part in parts]
     if not pairs or not all(key.strip() and equal and value for key, equal, value in pairs):
         raise argparse.ArgumentTypeError(f"needs NAME=VALUE,NAME=VALUE; given {text}")
     values = {
@@ -201,6 +222,18 @@ def parse_assignments(text: str) -> dict[str, str | tuple[str, ...]]:
         for key, _, value in pairs
     }
     return {key: each[0] if len(each) == 1 else each for key, each in values.items()}
+
+
+class MergePairs(argparse.Action):
+    """Keep the pairs of an option that is given more than once."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any,
+        option_string: str | None = None,
+    ) -> None:  # fmt: skip
+        """Add the pairs to those that were given before."""
+        del parser, option_string
+        setattr(namespace, self.dest, {**getattr(namespace, self.dest), **values})
 
 
 def parse_decimal(text: str) -> float:

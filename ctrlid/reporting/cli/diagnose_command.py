@@ -20,6 +20,7 @@ from ..html_page import write_report
 from ..plot.axes import off_screen
 from .arguments import (
     PLANTS,
+    MergePairs,
     parse_assignment,
     parse_assignments,
     parse_decimal,
@@ -91,9 +92,10 @@ def add_parser(commands: Any) -> None:
         "is known, else the input that holds the model at rest)")  # fmt: skip
     add("--dt", type=parse_decimal, metavar="S",
         help="sampling period in seconds (default: that of the time column)")  # fmt: skip
-    add("--columns", type=parse_assignments, default={}, metavar="r=REF,u=VOLT,y=GAP",
+    add("--columns", type=parse_assignments, action=MergePairs, default={},
+        metavar="r=REF,u=VOLT,y=GAP",
         help="columns of r, u, y and time; several as in 'y=theta,alpha u=V'")  # fmt: skip
-    add("--units", type=parse_assignments, default={}, metavar="y=UNIT,u=UNIT",
+    add("--units", type=parse_assignments, action=MergePairs, default={}, metavar="y=UNIT,u=UNIT",
         help="units of the channels r, u and y, or of single columns, instead of those in the "
         "header")  # fmt: skip
     add("--scale", type=parse_assignment, nargs="+", action="extend", default=[],
@@ -103,6 +105,7 @@ def add_parser(commands: Any) -> None:
     add(
         "--names",
         type=parse_assignments,
+        action=MergePairs,
         default={},
         metavar="COLUMN=NAME",
         help="what the model calls the signals of columns, as in --names Ball=x,Wippe=theta",

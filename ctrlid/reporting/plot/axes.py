@@ -164,6 +164,10 @@ class Picture:
         """The matplotlib Figure."""
         return self.axes.flat[0].figure
 
+    def savefig(self, *args: Any, **options: Any) -> None:
+        """Save the figure, as `matplotlib.figure.Figure.savefig` does."""
+        self.figure.savefig(*args, **options)
+
     def __iter__(self) -> Iterator[Any]:
         return iter(self.axes)
 
