@@ -416,6 +416,17 @@ def test_a_stored_record_is_scaled_by_the_names_of_its_signals(tmp_path):
 # --- what tools of others write
 
 
+@pytest.mark.parametrize("dt", [5e-4, 3.25e-3, 0.01])
+def test_seconds_since_1970_give_the_period_that_was_meant(tmp_path, dt):
+    """Doubles of this size have a step of 0.24 us, which was in the digits of the period."""
+    t = 1.7e9 + 0.123 + dt * np.arange(200)
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "t,u,y\n" + "".join(f"{v!r},{k % 7},{k % 5}\n" for k, v in enumerate(t.tolist()))
+    )
+    assert cid.Record.from_csv(path).dt == dt
+
+
 @pytest.mark.parametrize("german", [False, True])
 def test_points_and_commas_in_numbers_of_one_file_are_refused(tmp_path, german):
     """Thousands that are parted by the sign of the decimals were a thousand times too small."""

@@ -254,3 +254,60 @@ def test_the_doubt_about_parameters_is_that_about_the_loops_that_are_compared(mo
     monkeypatch.setattr(fresh_data, "pseudo_inverse", lambda m: 1e-12 * exact(m))
     assert fresh.measure_doubt(model).max() < 1e-3 * usual.min()
     assert gap.root_mean_square(fresh.windows, fresh.simulate_outputs([loop])) < 2.5e-3
+
+
+# --- a sensor that is slower than the others
+
+
+def two_readings(controller=None):
+    """A mass on a spring of which position and speed are measured."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], u[0] - p["k"] * x[0] - 2.0 * x[1]]),
+        lambda t, x, u, p: x, inputs=["F"], outputs=["x", "v"], states=["x", "v"],
+        params={"k": 9.0}, name="spring",
+    )  # fmt: skip
+    return cid.Loop(plant, controller, dt=0.02, free=("k",))
+
+
+def slow_first_sensor(record, every=5, other=-999.0):
+    """Of the first output each fifth reading counts; what stands between is no reading."""
+    k = np.arange(len(record))
+    valid = np.array([k % every == 0, np.ones(len(record), bool)])
+    return replace(record, valid=valid, y=np.where(valid, record.y, other))
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_slow_sensor_takes_nothing_from_the_others(closed):
+    """The gap was infinite, and the record refused for 400 valid samples, none in succession."""
+    law = (
+        ct.ss([], [], [], [[-4.0, -0.5]], 0.02, inputs=["x", "v"], outputs=["F"])
+        if closed
+        else None
+    )
+    loop = two_readings(law)
+    d = cid.random_binary(2000, amplitude=1.0, hold=25, seed=1)
+    whole = cid.simulate(loop, d=d, sensor_noise=[1e-3, 2e-3], seed=2)
+    record = slow_first_sensor(whole)
+    assert not cid.audit(record)["too few samples"]
+    fresh = choose_fresh_data(loop, [record], None)
+    assert (fresh.how.horizon > 0) == closed
+    made = fresh.simulate_outputs([loop])[0]
+    errors = made - fresh.windows[0].record.y
+    for row, mask, noise in zip(errors, fresh.windows[0].mask, (1e-3, 2e-3), strict=True):
+        use = mask & np.isfinite(row)
+        assert np.count_nonzero(use) > 50
+        assert np.std(row[use]) == pytest.approx(noise, rel=0.25)
+    found = cid.diagnose(loop, record, catalogue=(E.CoulombFriction,), progress=False)
+    assert (found.verdict, found.findings) == ("nothing missing", ())
+    assert found.gap.after == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_missing_effect_is_found_with_a_slow_sensor():
+    real = two_readings().with_effect(E.CoulombFriction(fc=0.2))
+    d = cid.random_binary(2000, amplitude=1.0, hold=25, seed=1)
+    record = slow_first_sensor(cid.simulate(real, d=d, sensor_noise=[1e-3, 2e-3], seed=2))
+    few = (E.CoulombFriction, E.ViscousFriction, E.InputDelay)
+    found = cid.diagnose(two_readings(), record, catalogue=few, progress=False)
+    assert [f.name for f in found.findings] == ["CoulombFriction"]
+    assert found.findings[0].effect.fc == pytest.approx(0.2, rel=0.05)
+    assert found.gap.after < 1.3

@@ -198,6 +198,11 @@ class Record(Printed):
         """Which samples count for all outputs, shape (n,)."""
         return self.valid if self.valid.ndim == 1 else self.valid.all(axis=0)
 
+    @property
+    def valid_somewhere(self) -> Any:
+        """Which samples count for one output at least, shape (n,)."""
+        return self.valid if self.valid.ndim == 1 else self.valid.any(axis=0)
+
     def select(
         self, *, r: str | Sequence[str] | None = None, u: str | Sequence[str] | None = None,
         y: str | Sequence[str] | None = None,
@@ -705,3 +710,16 @@ def list_rows(record: Record) -> list[tuple[str, str, str, Any]]:
 
 def _rebuild(fields: dict[str, Any]) -> Record:
     return Record(**fields)
+
+
+def fill_readings(record: Record) -> Record:
+    """Return a record with straight lines in the place of readings that do not count.
+
+    Of several outputs, for where each of them has a part in what the others say.
+    """
+    if record.valid.ndim == 1 or record.valid.all():
+        return record
+    k = np.arange(len(record))
+    rows = zip(np.reshape(record.y, (-1, len(record))), record.valid_outputs, strict=True)
+    y = [np.interp(k, k[use], row[use]) if use.any() else row for row, use in rows]
+    return replace(record, y=np.reshape(y, np.shape(record.y)))

@@ -127,7 +127,10 @@ def question_period(dt: float, stamps: Any, path: Path, label: str) -> None:
 def _estimate_period(stamps: Any) -> float:
     """Return the mean period of time stamps, with no digits that only round-off gave it."""
     mean = float(stamps[-1] - stamps[0]) / (len(stamps) - 1)
-    return drop_roundoff(mean, 4 * float(np.spacing(np.abs(stamps).max())))
+    finest = float(np.spacing(np.abs(stamps).max()))
+    usual = drop_roundoff(mean, 4 * finest)
+    # The mean of a few seconds since 1970 has digits that only the size of the stamps gave it.
+    return _shorten_period(usual, 2 * finest / (len(stamps) - 1))
 
 
 def _find_resolution(stamps: Any) -> float:

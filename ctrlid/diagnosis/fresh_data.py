@@ -194,7 +194,7 @@ class FreshData:
                 plain, record, make_prediction(here), horizon, window.start_time
             )
             spreads = compute_spreads_ahead(
-                here.linearized[0], fit.noise, record.valid_samples, horizon
+                here.linearized[0], fit.noise, record.valid_somewhere, horizon
             )
             measured, made, masks = (
                 np.reshape(v, (outputs, -1)) for v in (record.y, y.T, window.predicted)

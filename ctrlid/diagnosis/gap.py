@@ -348,7 +348,7 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
         simulator = make_gap_simulator(loop, record.hold, record.hold_r)
     except (ModelCannotRun, EffectDoesNotApply):
         return y
-    for part in find_long_stretches(record):
+    for part in find_long_stretches(record, loop):
         try:
             stretch = prepare_stretch(simulator, record, part, start_time=window.start_time)
             y[..., part] = _average_runs(stretch, simulator, window.noises, part)
@@ -525,7 +525,7 @@ def _simulate_noise(
         return np.tile(size * known**2, (runs, 1))
     simulator = make_gap_simulator(loop, record.hold, record.hold_r)
     squares, count = np.zeros((*np.shape(size), runs, 2)), np.zeros_like(size)
-    for part in find_long_stretches(record):
+    for part in find_long_stretches(record, loop):
         use = window.mask[..., part]
         if not use.any():
             continue

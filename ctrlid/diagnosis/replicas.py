@@ -101,7 +101,7 @@ def _simulate_record(
     loop = sharpen_effects(loop, THRESHOLD.replica_sharpness)
     simulator = make_gap_simulator(loop, record.hold, record.hold_r, THRESHOLD.replica_steps)
     y, u = np.array(record.y), np.array(record.u)
-    for part in find_long_stretches(record, THRESHOLD.shortest_segment):
+    for part in find_long_stretches(record, model.loop, THRESHOLD.shortest_segment):
         stretch = prepare_stretch(simulator, record, part, start_time=first, follow=follows)
         noise = draw_noise(model.fit, sensor, stretch.d.shape[-1], seed + part.start)
         y[..., part], u[..., part] = stretch.run(simulator, noise)

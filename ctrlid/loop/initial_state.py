@@ -8,7 +8,7 @@ from scipy import optimize
 
 from .._base.arrays import Array
 from .._base.errors import ModelCannotRun
-from ..data.record import Record
+from ..data.record import Record, fill_readings
 from ..effects.context import find_motion
 from ..physics.linearization import compute_state_matrices
 from .period_map import find_memory_range
@@ -44,7 +44,7 @@ def find_initial_state(
     simulator : Simulator
         The loop.
     part : Record
-        The record, without gaps.
+        The record, without gaps in which no output counts.
     r : ndarray or None
         Its reference.
     d : ndarray
@@ -65,6 +65,8 @@ def find_initial_state(
         The state: where it is measured, no faster than the record moves, with lags of the input
         within what they follow, and a backlash within its gap.
     """
+    counted = np.reshape(part.valid_outputs, np.shape(part.y))
+    part = fill_readings(part)
     if simulator.loop.equations().siso:
         spread: Any = max(float(np.std(part.y)), 1e-12 * float(np.abs(part.y).max()), 1e-300)
         scale = np.maximum(0.01 * np.abs(guess[:fitted]), spread)
@@ -99,7 +101,8 @@ def find_initial_state(
             )
         except ModelCannotRun:
             return None
-        return np.ravel(np.asarray((y - part.y[..., :count]) / spread, dtype=float))
+        misfit = np.where(counted[..., :count], (y - part.y[..., :count]) / spread, 0.0)
+        return np.ravel(np.asarray(misfit, dtype=float))
 
     def move_state(start: Array, point: Array) -> Array:
         z = start.copy()

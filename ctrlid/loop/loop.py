@@ -67,7 +67,8 @@ class Loop(Printed):
     plant : control.NonlinearIOSystem, control.StateSpace or control.TransferFunction
         The plant, continuous or with the sampling period `dt`.
     controller : TransferFunction, StateSpace, NonlinearIOSystem or PID, optional
-        One input (r - y), or two inputs (r, y); or several, wired as above. A controller in
+        One input (r - y), or two inputs (r, y), of which the one that is called y or as the output
+        of the plant is y; or several, wired as above. A controller in
         discrete time and a `PID` hold their output between samples, a continuous one is an analog
         circuit. None: the loop is open, or the controller is unknown.
     dt : float

@@ -281,7 +281,7 @@ def _run_simulation(
     y, noisy = np.full(np.shape(record.y), np.nan), np.zeros(np.shape(record.y))
     injected = np.zeros(np.shape(record.u))
     simulator = make_simulator(loop, hold=record.hold, hold_r=record.hold_r)
-    for part in find_long_stretches(record):
+    for part in find_long_stretches(record, loop):
         stretch = prepare_stretch(
             simulator, record, part, start_time=0.0, guess=prediction.states[part.start],
             seek_controller=True, set_point=True,

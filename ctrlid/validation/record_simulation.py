@@ -8,12 +8,14 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import ModelCannotRun
-from ..data.record import Record
+from ..data.record import Record, fill_readings
+from ..data.validity import find_runs
 from ..estimation.likelihood.filter_data import FEWEST
 from ..loop.controller_replay import read_references, replay_from_best_state, run_controller
 from ..loop.controller_sight import Sight, find_sight
 from ..loop.controllers import PID
 from ..loop.initial_state import FEW, FIRST, find_initial_state
+from ..loop.loop import Loop
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import Simulator, make_simulator
 from ..loop.wiring import knows_references
@@ -63,9 +65,14 @@ class Stretch:
         return y if logged is None else y + np.reshape(logged, np.shape(y)), u
 
 
-def find_long_stretches(record: Record, shortest: int = FEWEST) -> list[slice]:
-    """Return the valid stretches of a record that have at least so many samples."""
-    return [slice(a, b) for a, b in record.segments() if b - a >= shortest]
+def find_long_stretches(record: Record, loop: Loop, shortest: int = FEWEST) -> list[slice]:
+    """Return the stretches of a record that can be simulated and have at least so many samples.
+
+    A controller has to know what all outputs read; without one a slow sensor, most of whose samples
+    do not count, takes nothing from the others.
+    """
+    valid = record.valid_somewhere if loop.controller is None else record.valid_samples
+    return [slice(a, b) for a, b in zip(*find_runs(valid), strict=True) if b - a >= shortest]
 
 
 def prepare_stretch(
@@ -126,7 +133,7 @@ def prepare_stretch(
     if loop.controller is None:
         pass
     elif follow:
-        r = np.asarray(part.y)
+        r = np.asarray(fill_readings(part).y)
     elif loop.analog:
         if r is None:
             raise ModelCannotRun(

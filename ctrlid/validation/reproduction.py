@@ -11,6 +11,7 @@ from ..loop.period_map import comes_to_rest
 from ..loop.wiring import knows_references
 from ..physics.linearization import compute_state_matrices
 from .controller_check import find_rejection
+from .record_simulation import find_long_stretches
 from .wired_controller_check import find_wired_rejection
 
 Name = Literal["closed-loop simulation", "open-loop simulation", "prediction"]
@@ -40,6 +41,7 @@ CLOSED_LOOP = Reproduction("closed-loop simulation")
 # Why a record is predicted and not simulated.
 NO_CONTROLLER = "no controller is given, and the plant alone does not come to rest"
 NO_REFERENCE = "the record lacks a reference of the controller"
+MISSING = "nowhere are all readings known that the controller had"
 REJECTED = "the law of the controller is rejected, since it is not what computed the logged input"
 
 
@@ -59,6 +61,8 @@ def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
         return OPEN_LOOP if comes_to_rest(loop) else choose_prediction(loop, record, NO_CONTROLLER)
     if not knows_references(loop.wiring, record):
         return choose_prediction(loop, record, NO_REFERENCE)
+    if not find_long_stretches(record, loop):
+        return choose_prediction(loop, record, MISSING)
     if find_law_rejection(loop, record):
         return choose_prediction(loop, record, REJECTED)
     return CLOSED_LOOP

@@ -275,7 +275,7 @@ def _prepare(
     simulator = make_simulator(loop, most=SUBSTEPS, hold=hold, hold_r=hold_r)
     stretches, substeps = [], 1
     for record in records:
-        for samples in find_long_stretches(record):
+        for samples in find_long_stretches(record, loop):
             made = prepare_stretch(simulator, record, samples, start_time=0.0, seek_controller=True)
             *_, needed = simulator.run_in_steps(
                 1, made.initial, made.r, made.d, start_time=made.start_time

@@ -59,6 +59,8 @@ def check_wired_controller(loop: Loop, record: Record) -> list[Fact]:
     if record.n - first < FEWEST:
         return []
     part = record[first : first + MOST]
+    if not any(b - a >= FEWEST for a, b in part.segments()):
+        return []  # Nowhere are all readings known that the controller had.
     try:
         remainder = _compute_remainder(loop, part)
     except CtrlidError as reason:  # The audit prints a refusal among its facts.
@@ -76,8 +78,7 @@ def _compute_remainder(loop: Loop, record: Record) -> tuple[Any, Any]:
     """Return what the controller leaves of each input, and the samples on which that is known."""
     inputs = _list_rows(record, "u")
     left, use = np.zeros(inputs.shape), np.zeros(record.n, dtype=bool)
-    long = [(a, b) for a, b in record.segments() if b - a >= FEWEST]
-    for a, b in long or [(0, record.n)]:
+    for a, b in [(a, b) for a, b in record.segments() if b - a >= FEWEST]:
         replayed = replay_controller(loop, record[a:b])
         left[:, a:b] = inputs[:, a:b] - np.reshape(replayed, (len(inputs), -1))
         use[a:b] = True

@@ -256,11 +256,16 @@ def predict_ahead(
     y : ndarray
         Their predictions; of several outputs, a column for each.
     """
-    every = max(1, horizon // 4)
+    # A slow sensor may have no reading at any of the samples in between.
+    whole = np.array_equal(record.valid_samples, record.valid_somewhere)
+    every = max(1, horizon // 4) if whole else 1
     starts = np.arange(0, len(record) - horizon, every)
-    known = find_whole_past(record.valid_samples, horizon)[starts + horizon]
-    settled = np.atleast_2d(prediction.settled)[:, starts].all(axis=0)
-    starts = starts[known & settled]
+    known = np.asarray(find_whole_past(record.valid_somewhere, horizon))[starts + horizon]
+    seen = np.atleast_2d(prediction.settled)
+    # Of several outputs each has to have been read before, and one now.
+    read = np.asarray(np.maximum.accumulate(seen, axis=1).all(axis=0) & seen.any(axis=0))
+    known &= read[starts]
+    starts = starts[known]
     if not len(starts):
         return starts, np.empty(0)
     problem = make_problem(_drop_neutral_effects(loop), (), [record], [start_time])
@@ -330,7 +335,7 @@ def _predict_several_spreads(
     forces = tuple(np.maximum((force / sensor[0]) ** 2, 1e-300).tolist())
     lin = begin_fit(problem, noise=Noise(forces, sensors=sensors)).linearized[0]
     quiet = tuple(0.0 for _ in forces)
-    valid = problem.data[0].record.valid_samples
+    valid = problem.data[0].record.valid_somewhere
     both, alone = (
         sensor[0] * compute_spreads_ahead(lin, Noise(v, sensors=sensors), valid, horizon)
         for v in (forces, quiet)
