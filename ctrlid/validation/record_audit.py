@@ -67,8 +67,8 @@ class AuditFinding(Printed):
     kind : str
         ``"saturation"``, ``"quantization"``, ``"repeats"``, ``"dropped samples"``, ``"outliers"``,
         ``"drift"``, ``"offset"``, ``"too little excitation"``, ``"constant signal"``,
-        ``"too few samples"``, ``"between samples"``, ``"controller"``, ``"units"`` or
-        ``"operating point"``;
+        ``"too few samples"``, ``"between samples"``, ``"controller"``, ``"units"``,
+        ``"wrapped"`` (an angle or a counter that starts over) or ``"operating point"``;
         where the stated controller does not compute the logged u, what is wrong with it:
         ``"gain"``, ``"sign"``, ``"bias"``, ``"delay"``, ``"limit"``, ``"filter"``, ``"sampled"``
         (it is stated as analog, and was sampled) or ``"unknown"``. A ``"filter"`` is also another
