@@ -534,6 +534,10 @@ JUMPS = {
     "telegraph": lambda rng: rng.choice([-3.1, 3.1], 600),
     "noise": lambda rng: 1.5 * rng.standard_normal(600).clip(-2, 2),
     "walk": lambda rng: np.cumsum(rng.standard_normal(600)),
+    "switch": lambda rng: 256.0 * rng.integers(0, 2, 600),
+    "lost readings": lambda rng: np.where(
+        rng.random(600) < 0.01, 0.0, 4079.0 + rng.integers(0, 9, 600)
+    ),
     "bytes": lambda rng: 127.0 * np.sign(np.sin(np.arange(600) / 20)),
     "steps": lambda rng: (
         3.1 * np.sign(np.sin(np.arange(600) / 20)) + 0.01 * rng.standard_normal(600)
@@ -548,11 +552,32 @@ def test_jumps_of_other_kinds_are_no_turn(kind):
     assert not cid.audit(record)["wrapped"]
 
 
+@pytest.mark.parametrize("digits", [2, 3, 4, 6])
+def test_a_rounded_turn_is_a_turn(digits):
+    """Plus and minus 3.142 are further apart than two pi."""
+    y = np.round(np.mod(0.02 * np.arange(2000) + np.pi, 2 * np.pi) - np.pi, digits)
+    record = cid.Record(u=np.sin(np.arange(2000) / 30), y=y, dt=0.01)
+    (found,) = cid.audit(record)["wrapped"]
+    assert found.size == 6
+
+
+def test_a_reference_that_starts_over_as_well_is_told():
+    _, record = turning()
+    y = np.mod(record.y, 2 * np.pi)
+    ramp = np.mod(np.linspace(0.0, 40.0, 1500), 2 * np.pi)
+    (found,) = cid.audit(replace(record, y=y, r=ramp))["wrapped"]
+    assert "make both continuous" in found.text
+    (found,) = cid.audit(replace(record, y=y))["wrapped"]
+    assert "reference" not in found.text
+
+
 def test_each_of_several_outputs_may_start_over():
     _loop, record = turning()
     y = np.mod(record.y, 2 * np.pi)
     both = cid.Record(u=record.u, y=[record.y, y], names={"y": ("phi", "psi")}, dt=0.01)
-    assert [f.channel for f in cid.audit(both)["wrapped"]] == ["psi"]
+    (found,) = cid.audit(both)["wrapped"]
+    assert found.channel == "psi"
+    assert "numpy.unwrap(the row of psi, period=2 * numpy.pi)" in found.text
 
 
 # --- signals that repeat themselves
@@ -566,6 +591,8 @@ def test_a_periodic_input_is_neither_limited_nor_quantized(phases, period):
     loop = cid.Loop(ct.tf([1], [1, 1]), None, dt=0.1)
     record = cid.simulate(loop, d=u, sensor_noise=1e-2, seed=1)
     assert not [f.kind for f in cid.audit(record).findings if f.channel == "u"]
+    sine = replace(record, u=np.sin(2 * np.pi * np.arange(2000) / (period / 2)))
+    assert not cid.audit(sine)["saturation"]
 
 
 def test_a_periodic_input_that_is_limited_is_said_to_be():

@@ -442,6 +442,21 @@ def test_points_and_commas_in_numbers_of_one_file_are_refused(tmp_path, german):
     assert cid.Record.from_csv(path, u="volt", y="pos").y[-1] == 1009.0
 
 
+def test_signs_in_comments_and_in_texts_say_nothing_of_numbers(tmp_path):
+    path = tmp_path / "log.csv"
+    rows = "".join(f"{k};0,5;1.2;v1.3\n" for k in range(9)).replace("0;0,5;1.2", "0;0,5;x")
+    path.write_text("t [s];u;firmware;y\n# 1.5 ; 2.5\n" + rows.replace("v1.3", "1,5"))
+    record = cid.Record.from_csv(path)
+    assert (record.u[0], record.y[0]) == (0.5, 1.5)
+
+
+def test_lost_rows_of_rounded_times_do_not_contradict_a_stated_period(tmp_path):
+    path = tmp_path / "log.csv"
+    kept = [k for k in range(90) if k not in (20, 41, 60, 77)]
+    path.write_text("t,u,y\n" + "".join(f"{1.02e-3 * k:.3f},1,{k}\n" for k in kept))
+    assert cid.Record.from_csv(path, dt=1.02e-3, gaps="mask").dt == 1.02e-3
+
+
 def test_a_stated_period_that_the_times_contradict_is_refused(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("t,u,y\n" + "".join(f"{k / 100:.2f},{k % 7},{k % 5}\n" for k in range(2000)))
@@ -481,6 +496,17 @@ def test_refusals_say_what_to_do(tmp_path, text, words):
     path.write_bytes(text)
     with pytest.raises(CtrlidError, match=words):
         cid.Record.from_csv(path)
+
+
+def test_no_channel_is_lost_by_the_name_of_another(tmp_path):
+    one = cid.Record(u=[0, 1, 2], y=[1, 2, 3], extra={"theta": [7, 8, 9], "z": [4, 5, 6]},
+                     names={"y": "theta", "u": "V"}, dt=1.0)  # fmt: skip
+    one.to_csv(tmp_path / "own.csv")
+    other = cid.Record.from_csv(tmp_path / "own.csv", y="z")
+    assert {k: v.tolist() for k, v in other.extra.items()} == {
+        "theta": [7, 8, 9], "logged y": [1, 2, 3]}  # fmt: skip
+    swapped = cid.Record.from_csv(tmp_path / "own.csv", y="u", u="y")
+    assert dict(swapped.names) == {"y": "V", "u": "theta"}
 
 
 @pytest.mark.parametrize(("names", "spare"), [({"y": "pos"}, "pos"), ({}, "logged y")])

@@ -458,14 +458,22 @@ def test_a_model_file_is_run_as_python_runs_it(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     found = import_object("--model", f"{tmp_path / 'rig_of_test.py'}:servo")
     assert found.num[0][0][0] == 3.0
+    # A file may be called as a package that it imports, and leaves no trace.
+    (tmp_path / "control.py").write_text("import control as ct\nservo = ct.tf([1], [1, 0])\n")
+    modules = dict(sys.modules)
+    assert import_object("--model", f"{tmp_path / 'control.py'}:servo").den[0][0].tolist() == [1, 0]
+    assert sys.modules["control"] is ct
+    assert set(sys.modules) == set(modules)
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("x = (1\n", r"SyntaxError: '\(' was never closed \(line 1 of"),
-        ("import math\n1 / 0\n", r"ZeroDivisionError: division by zero \(line 2 of"),
-        ("import no_such_module\n", "That file imports it"),
+        ("x = (1\n", r"SyntaxError: '\(' was never closed \(line 1\)"),
+        ("import math\n1 / 0\n", r"ZeroDivisionError: division by zero \(line 2\)"),
+        ("import no_such_module\n", "It is imported there"),
+        ("import numpy\nnumpy.loadtxt('no_such_file.csv')\n", r"FileNotFoundError: .* \(line 2\)"),
+        ("import control as ct\nct.tf('a', 'b')\n", r"cannot be run: .* \(line 2\)"),
     ],
 )
 def test_what_is_wrong_in_a_model_file_is_told_in_one_line(tmp_path, monkeypatch, text, words):

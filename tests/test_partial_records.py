@@ -197,8 +197,8 @@ def test_a_record_without_its_reference_lets_no_analog_controller_be_followed():
 def test_references_that_run_differently_between_samples_are_refused():
     loop = servo(controller=ct.tf([20.0], [1.0]))
     one = record_of(loop, 300)
-    with pytest.raises(cid.CtrlidError, match="hold_r='zoh' and hold_r='foh'"):
-        cid.fit_loop(loop, [one, replace(one, hold_r="foh")])
+    with pytest.raises(cid.CtrlidError, match="hold_r='foh' and hold_r='zoh'"):
+        cid.fit_loop(loop, [replace(one, r=None), one, replace(one, hold_r="foh")])
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -311,3 +311,26 @@ def test_a_missing_effect_is_found_with_a_slow_sensor():
     assert [f.name for f in found.findings] == ["CoulombFriction"]
     assert found.findings[0].effect.fc == pytest.approx(0.2, rel=0.05)
     assert found.gap.after < 1.3
+
+
+def test_outputs_that_are_read_in_turn_leave_the_input_whole():
+    """No sample counts for both, and u is known at all of them."""
+    loop = two_readings()
+    d = cid.random_binary(600, amplitude=1.0, hold=25, seed=1)
+    record = cid.simulate(loop, d=d, sensor_noise=[1e-3, 2e-3], seed=2)
+    k = np.arange(600) % 2
+    turns = replace(record, valid=np.array([k == 0, k == 1]))
+    kinds = (E.InputDeadZone, E.InputSaturation)
+    whole, half = (list_candidates(kinds, loop, one) for one in (record, turns))
+    assert [c.values() for c in half] == [c.values() for c in whole]
+    found = cid.diagnose(loop, turns, catalogue=(E.CoulombFriction,), progress=False)
+    assert (found.verdict, found.findings) == ("nothing missing", ())
+
+
+def test_readings_beyond_a_known_limit_are_not_taken_out():
+    """A limit that is wrong must show; it took all readings beyond it out of the record."""
+    wrong = replace(RANGE, lower=-0.02, upper=0.02)
+    record = record_of(servo(), 600)
+    found = cid.diagnose(servo(wrong), record, catalogue=FEW, progress=False)
+    assert found.gap.after > 5 * found.gap.floor
+    assert found.calibrated[0].after == pytest.approx(3.0, abs=0.05)

@@ -385,6 +385,15 @@ def test_a_size_counted_per_square_or_cube_is_one_of_a_force_as_well(effect, uni
     assert f" {unit}" in loop.effects[0].text(loop)
 
 
+def test_a_unit_that_is_not_known_leaves_the_others_apart():
+    plant = ct.nlsys(lambda t, x, u, p: [x[2], x[3], u[0], u[1]], lambda t, x, u, p: x[:2],
+                     inputs=["F", "Q"], outputs=["x1", "x2"], states=["x1", "x2", "v1", "v2"],
+                     name="own")  # fmt: skip
+    known = cid.Loop(plant, units={"F": "", "x1": "m"}, forces={"v1": "F", "v2": "Q"}, dt=0.01)
+    assert E.ViscousFriction(c=0.8, at="v1").text(known).endswith("c = 0.8 [F] s/m")
+    assert E.QuadraticDrag(c2=0.8, at="v1").text(known).endswith("c2 = 0.8 [F] s^2/m^2")
+
+
 def evaluate_rates(loop, x, u):
     e = loop.equations(keep=True)
     rates = casadi.Function("rates", [e.t, e.x, e.u, e.p], [e.rhs])

@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -117,14 +117,13 @@ def read_csv(
         extra = [label for k, label in enumerate(names)
                  if k not in taken and label.partition(" ")[0] != "valid"]  # fmt: skip
         extra = extra if own else ()
-        # A signal that another column takes the place of keeps its own name, or a new one.
-        spare = own.get("names", {})
-        further = {
-            _name_spare(names[k], spare) if names[k] in SIGNALS else names[k]: k
-            for k in (place(c, "extra") for c in extra)
-        }
-    else:
-        further = {names[k]: k for k in (place(c, "extra") for c in extra)}
+    # A signal that another column takes the place of keeps its own name, or gets one that is free.
+    spare = [(k, names[k]) for k in (place(c, "extra") for c in extra)]
+    others = {label for _, label in spare}
+    further = {
+        _name_spare(label, own, others) if own and label in SIGNALS else label: k
+        for k, label in spare
+    }
     counting = [place("valid", "valid")] if "valid" in names else []
     each = [f"valid {name}" for name in columns["y"]]
     counted = len(each) > 1 and each[0] in names
@@ -171,7 +170,10 @@ def read_csv(
         key: (v,) if isinstance(v, str) else tuple(v) for key, v in own.get("columns", {}).items()
     }
     called = {key: v for key, v in own.get("names", {}).items() if known.get(key) == stored[key]}
-    called |= {key: v for key, v in known.items() if v != stored[key]}
+    called |= {
+        key: tuple(_name_stored(label, own) for label in v)
+        for key, v in known.items() if v != stored[key]
+    }  # fmt: skip
     spoken = list_names(every, names, header, called)
     if renamed:
         own_words = list_names(at, names, header, called)
@@ -202,11 +204,20 @@ def read_csv(
     }  # fmt: skip
 
 
-def _name_spare(key: str, names: Mapping[str, Any]) -> str:
+def _name_spare(key: str, own: Mapping[str, Any], others: Collection[str]) -> str:
     """Return what a signal of a file is called as a channel beside the one in its place."""
-    own = names.get(key, ())
-    own = (own,) if isinstance(own, str) else tuple(own)
-    return own[0] if len(own) == 1 and own[0] not in SIGNALS else f"logged {key}"
+    known = _name_stored(key, own)
+    name = f"logged {key}" if known in SIGNALS or known in others else known
+    while name in others:
+        name = f"logged {name}"
+    return name
+
+
+def _name_stored(label: str, own: Mapping[str, Any]) -> str:
+    """Return what a file of ours calls the signal in a column; else the column's own name."""
+    called = own.get("names", {}).get(label, ())
+    called = (called,) if isinstance(called, str) else tuple(called)
+    return called[0] if label in SIGNALS and len(called) == 1 else label
 
 
 def _find_column(path: Path, header: Sequence[str], label: str, what: str) -> int:

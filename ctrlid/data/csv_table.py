@@ -125,21 +125,32 @@ def _is_empty(part: bytes) -> bool:
 
 
 def _refuse_two_signs(path: Path, body: str, separator: str, above: int) -> None:
-    """Refuse numbers with points beside numbers with commas: one of them parts thousands."""
+    """Refuse a column of numbers with points and with commas: one of them parts thousands.
+
+    A column may also have points alone where another has commas alone, as where only one of them is
+    large enough for thousands.
+    """
     if "." not in body or "," not in body:
         return
-    first: dict[str, str] = {}
+    first: dict[tuple[int, str], str] = {}
+    text: set[int] = set()
     for k, cells in enumerate(_read_cells(body, separator)):
-        for cell in cells:
+        if not cells or cells[0].lstrip().startswith("#"):
+            continue
+        for column, cell in enumerate(cells):
+            if not _is_number(cell):
+                text.add(column)
             for sign in ".,":
-                if sign in cell and sign not in first and _is_number(cell):
-                    first[sign] = f"{cell.strip()!r} in line {above + k + 1}"
-        if len(first) == 2:
-            raise CtrlidError(
-                f"{path} has numbers with points, such as {first['.']}, and numbers with commas, "
-                f"such as {first[',']}: one of the two signs parts thousands, and which of them "
-                "cannot be told. Save the file without it"
-            )
+                if sign in cell:
+                    here = f"{cell.strip()!r} in line {above + k + 1}"
+                    first.setdefault((column, sign), here)
+    seen = {sign: where for (column, sign), where in reversed(first.items()) if column not in text}
+    if len(seen) == 2:
+        raise CtrlidError(
+            f"{path} has numbers with points, such as {seen['.']}, and numbers with commas, such "
+            f"as {seen[',']}: one of the two signs parts thousands, and which of them cannot be "
+            "told. Save the file without it"
+        )
 
 
 def _refuse_decimal_commas(path: Path, row: str, separator: str, columns: int) -> None:

@@ -42,6 +42,13 @@ def as_records(data: Any) -> tuple[Record, ...]:
         raise CtrlidError(f"a Record or a list of Records is needed; the list given {what}")
     for record in records[1:]:
         _require_same_kind(records[0], record)
+    holds = sorted({one.hold_r for one in records if one.r is not None})
+    if len(holds) > 1:
+        raise CtrlidError(
+            "records used together need references that run alike between samples; given "
+            f"{' and '.join(f'hold_r={hold!r}' for hold in holds)}. Give all of them the one that "
+            "is right, as in dataclasses.replace(record, hold_r='zoh')"
+        )
     return tuple(records)
 
 
@@ -124,12 +131,6 @@ def _require_same_kind(first: Record, record: Record) -> None:
             "records used together need the same sampling period and the same hold; given "
             f"{first.dt:.10g} s, {first.hold!r} and {record.dt:.10g} s, {record.hold!r}. Decimate "
             "the faster one, or give both the hold that describes their input better"
-        )
-    if first.r is not None and record.r is not None and record.hold_r != first.hold_r:
-        raise CtrlidError(
-            "records used together need references that run alike between samples; given "
-            f"hold_r={first.hold_r!r} and hold_r={record.hold_r!r}. Give both the one that is "
-            "right, as in dataclasses.replace(record, hold_r='zoh')"
         )
 
 

@@ -63,7 +63,9 @@ def make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[
     regular = steps[steps < GAP * np.median(steps)]
     # Round-off of the stamps is no digit of the period, also where rows are lost.
     usual = drop_roundoff(float(np.mean(regular)), 4 * float(np.spacing(np.abs(stamps).max())))
-    unsure = CLOCK * usual + 8 * float(np.spacing(np.abs(stamps).max())) / (len(stamps) - 1)
+    # Where rows are lost, rounded stamps tell the period over the longest stretch without a gap.
+    stretch = np.diff(np.flatnonzero(np.r_[True, steps >= GAP * np.median(steps), True])).max()
+    unsure = CLOCK * usual + (rounding + 8 * float(np.spacing(np.abs(stamps).max()))) / stretch
     if dt is not None and not abs(usual - dt) < unsure:
         raise CtrlidError(f"the time column of {path} steps by {usual:.4g} s, but dt is {dt:g} s. "
                           "Leave out dt=, or remove the column; if its times are in another unit, "

@@ -18,6 +18,17 @@ def find_longest_run(mask: Any) -> slice:
     return slice(int(first[k]), int(stop[k]))
 
 
+def find_last_valid(valid: Any) -> Any:
+    """Return for each sample the last one that counts, before all of them the first.
+
+    Examples
+    --------
+    >>> find_last_valid(np.array([False, True, False, False, True])).tolist()
+    [1, 1, 1, 1, 4]
+    """
+    return np.maximum.accumulate(np.where(valid, np.arange(len(valid)), np.argmax(valid)))
+
+
 def find_whole_past(valid: Any, lags: int) -> Any:
     """Return which samples count together with all of a number of samples before them.
 

@@ -218,7 +218,7 @@ def _describe_steps(read: Readout, unit: str) -> str:
 def name_records(records: Sequence[Record]) -> str:
     """Return what the records are called, with their size."""
     names = ", ".join(dict.fromkeys(r.name or "record" for r in records))
-    size = sum(int(np.count_nonzero(r.valid_samples)) for r in records)
+    size = sum(int(np.count_nonzero(r.valid_somewhere)) for r in records)
     many = f"{len(records)} records, " if len(records) > 1 else ""
     return f"{names} ({many}{write_count(size, 'sample')}, dt = {records[0].dt:g} s)"
 

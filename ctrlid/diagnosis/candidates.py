@@ -11,6 +11,7 @@ import numpy as np
 from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
+from ..data.validity import find_last_valid
 from ..effects import AbstractEffect
 from ..effects.base import name_at_place
 from ..estimation.likelihood.sampled_plant import Trajectory
@@ -190,22 +191,15 @@ def list_candidates(
 
 
 def _hold_last_valid(record: Record) -> Record:
-    """Return a record in which samples that do not count repeat the last one that does."""
-    n, seen = len(record), np.asarray(record.valid_samples)
+    """Return a record in which what does not count repeats the last value that does."""
+    n, seen = len(record), np.asarray(record.valid_somewhere)
     each = np.reshape(record.valid_outputs, (-1, n))
-    if seen.all() and each.all():
+    if each.all():
         return record
-    u, y = (np.reshape(v, (-1, n)) for v in (record.u, record.y))
-    u, y = (
-        u[:, _find_last(seen)],
-        np.array([row[_find_last(use)] for row, use in zip(y, each, strict=True)]),
-    )
-    return replace(record, u=u.reshape(np.shape(record.u)), y=y.reshape(np.shape(record.y)))
-
-
-def _find_last(valid: Any) -> Any:
-    """Return for each sample the last one that counts, or else the first."""
-    return np.maximum.accumulate(np.where(valid, np.arange(len(valid)), np.argmax(valid)))
+    u = np.asarray(record.u)[..., find_last_valid(seen)]
+    rows = zip(np.reshape(record.y, (-1, n)), each, strict=True)
+    y = np.array([row[find_last_valid(use)] for row, use in rows])
+    return replace(record, u=u, y=y.reshape(np.shape(record.y)))
 
 
 def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:

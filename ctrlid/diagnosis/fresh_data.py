@@ -281,7 +281,7 @@ def check_length(fresh: FreshData) -> None:
     """
     if fresh.rest is None:
         return
-    left = sum(int(np.count_nonzero(r.valid_samples)) for r in fresh.rest)
+    left = sum(int(np.count_nonzero(r.valid_somewhere)) for r in fresh.rest)
     if left < FEW:
         raise CtrlidError(
             f"the record is too short for a diagnosis: {write_count(left, 'valid sample')} would "

@@ -13,7 +13,7 @@ from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.statistics import autocorrelation_time, rounding_variance
 from ..data.record import Record
-from ..data.validity import find_whole_past
+from ..data.validity import find_last_valid, find_whole_past
 from ..estimation.likelihood.kalman_filter import make_sensor_states
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.prediction import predict_ahead, predict_from, predict_spread
@@ -196,8 +196,7 @@ def _extrapolate(record: Record, horizon: int, samples: int) -> Array:
     slope = -middle / np.sum(middle**2) if samples > 1 else middle
     weights: Array = 1 / samples + (horizon + np.mean(ago)) * slope
     valid = np.asarray(record.valid)
-    last = np.maximum.accumulate(np.where(valid, np.arange(len(valid)), np.argmax(valid)))
-    y = np.asarray(record.y, dtype=float)[last]
+    y = np.asarray(record.y, dtype=float)[find_last_valid(valid)]
     line = np.append(np.full(horizon, np.nan), np.convolve(weights, y)[: len(y) - horizon])
     known = find_whole_past(valid, horizon + samples - 1)
     return np.where(known, line, np.append(np.full(horizon, np.nan), y[:-horizon]))

@@ -124,7 +124,7 @@ def _errs_less_than_rounding(fit: Fit) -> bool:
     usual = fit.sensor_noises
     records = [data.record for data in fit.data]
     for k, law in enumerate(laws):
-        steps = [find_grid_step(np.atleast_2d(r.y)[k][r.valid_samples]) for r in records]
+        steps = [find_grid_step(np.atleast_2d(r.y)[k][r.valid_outputs[k]]) for r in records]
         if law is not None and usual[k] < rounding_variance(max(steps)):
             return True
     return False

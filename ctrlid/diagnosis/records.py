@@ -191,8 +191,9 @@ def censor_record(record: Record, effect: SensorSaturation) -> Record:
     """Return a record in which samples on a limit of the sensor do not count."""
     slack = THRESHOLD.rounding * float(np.ptp(record.y))
     y = np.asarray(record.y)
-    free = (y > effect.lower + slack) & (y < effect.upper - slack)
-    return replace(record, valid=np.asarray(record.valid) & free)
+    # What lies beyond a limit is not on it: the limit is not that of this sensor.
+    at = (np.abs(y - effect.lower) <= slack) | (np.abs(y - effect.upper) <= slack)
+    return replace(record, valid=np.asarray(record.valid) & ~at)
 
 
 def read_steps(fit: Fit, audits: Sequence[Audit]) -> tuple[Readout, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.statistics import regress, rounding_variance
-from ..data.record import Record
+from ..data.record import Record, fill_readings
 from ..data.validity import find_whole_past
 from ..estimation.likelihood.filter_data import FilterData
 from ..estimation.likelihood.likelihood import (
@@ -255,9 +255,9 @@ def follow_record(loop: Loop, record: Record) -> Loop | None:
     """
     if loop.equations().feedthrough:  # No controller acts around it without delay.
         return None
-    use = record.valid_samples
-    u, y = (np.maximum(np.std(np.atleast_2d(v)[:, use], axis=1), THRESHOLD.tiny)
-            for v in (record.u, record.y))  # fmt: skip
+    whole = fill_readings(record)
+    u, y = (np.maximum(np.std(np.atleast_2d(v)[:, whole.valid_somewhere], axis=1), THRESHOLD.tiny)
+            for v in (whole.u, whole.y))  # fmt: skip
     if len(u) == len(y) == 1:
         made = _close_loop(loop, lambda: _regress_controller(record, loop.dt))
         if made is not None:

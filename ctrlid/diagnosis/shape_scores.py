@@ -231,7 +231,7 @@ def _list_kinds(
     kinds: dict[str, list[Columns]] = {}
     for data, lin, chosen, before in zip(fit.data, fit.linearized, acting, bins, strict=True):
         u = np.reshape(data.u, (len(data.u), -1))
-        away = u - np.mean(u[np.reshape(data.valid, (len(data.valid), -1)).all(axis=1)], axis=0)
+        away = u - np.mean(u[np.reshape(data.valid, (len(data.valid), -1)).any(axis=1)], axis=0)
         for j, name in enumerate(forces):
             by, place = lin.b[:, :, j], f" at {name}" if len(forces) > 1 else ""
             kinds.setdefault(f"force{place}", []).append(_push(lin, by, chosen))

@@ -281,14 +281,13 @@ class AbstractEffect(metaclass=CheckedCalls):
         if not force:
             return units
         # Of accelerations and what is counted per velocity or position, these are the forces.
-        u = signals.get("u", "")
+        u = signals.get("u") or "[u]"
         forces = {
             "{y}/s^2": force, "1/s": f"{force} s/{position}", "1/s^2": f"{force}/{position}",
             "1/{y}": f"{force} s^2/{position}^2", "1/(s^2 {y}^2)": f"{force}/{position}^3",
             "1/(s {u}^2)": f"{force} s/({position} {u}^2)",
         }  # fmt: skip
-        forces = {fill_unit(key, signals): unit for key, unit in forces.items()}
-        return {name: forces.get(unit, unit) for name, unit in units.items()}
+        return {p.name: forces.get(p.unit, units[p.name]) for p in self._list_used()}
 
     def text(self, loop: Any = None) -> str:
         """Return the effect in words, with the units of a loop if one is given."""

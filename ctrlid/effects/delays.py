@@ -235,7 +235,7 @@ class InputRateLimit(MemoryEffect):
         """Return a speed that holds back some of the steps of the recorded input."""
         if record is None:
             return cls._applicable(loop, cls(rate=max(abs(float(loop.point.input)), 1.0) / loop.dt))
-        rates = _find_rates(record.u[..., record.valid_samples], loop.dt)
+        rates = _find_rates(record.u[..., record.valid_somewhere], loop.dt)
         return cls._applicable(loop, cls(rate=rates[len(rates) // 2])) if rates else ()
 
     def scan(self, sight: Sight) -> Scan | None:

@@ -217,22 +217,23 @@ def _find_input_order(names: list[str], output: str) -> tuple[int, int]:
     """
     measured = [name in (output, "y", "y[0]") for name in names]
     if len(names) == 1:
-        if measured[0] and output != "e":
+        if measured[0] and names[0] != "e":
             raise CtrlidError(
-                f"the controller's only input is called {names[0]}, as the output of the plant, "
-                "but a controller with one input acts on r - y. Call it e if it does; a law "
-                f"u = C(y) has two inputs, r and {output}, and does nothing with r"
+                f"the controller's only input is called {names[0]}, as an output is, but a "
+                "controller with one input acts on r - y. Call it e if it does; a law u = C(y) has "
+                f"two inputs, r and {output}, and does nothing with r"
             )
         return 0, 1
-    known = names == ["u[0]", "u[1]"] or "r" in names or sum(measured) == 1
-    if not known:
+    if names == ["u[0]", "u[1]"]:
+        return 0, 1
+    # An error or a rate is neither: such a law is one of several signals.
+    if sum(measured) != 1 or "e" in names:
         raise CtrlidError(
             f"the controller's inputs are called {names[0]} and {names[1]}, which does not say "
             f"which of them is the plant's output {output} and which the reference: call them r "
             f"and {output}, in any order"
         )
-    first = measured[0] and not measured[1] if sum(measured) == 1 else names[1] == "r"
-    return (1, 0) if first else (0, 1)
+    return (1, 0) if measured[0] else (0, 1)
 
 
 def require_proper(controller: Any) -> None:

@@ -594,7 +594,7 @@ class Loop(Printed):
             return ""
         at, e = self._bare_point, self._traced
         shown = e.evaluate(np.array(at.states), np.array(at.inputs))[1]
-        small = 1e-9 * max(map(abs, (*at.states, *at.inputs)), default=0.0)
+        small = 1e-3 * max(map(abs, at.states), default=0.0)
         others = [
             f"{name} = {there:g}"
             for name, given, there in zip(e.outputs, at.outputs, shown.tolist(), strict=True)

@@ -31,7 +31,8 @@ TINY = 1e-12
 UNBALANCED = 0.05
 # Where nothing balances a rate, this share of the terms is left.
 NOT_AT_ALL = 0.9
-# The search for equilibria starts from so many random points.
+# The search for equilibria starts from so many random points, and from as many far ones where they
+# find none.
 STARTS = 60
 # As large as a state is sought, where nothing is found nearer.
 FARTHEST = 1e8

@@ -447,16 +447,20 @@ class _RecordChecks:
         period, at = defects.find_wraps(self.record.y, self.valid)
         if not period:
             return []
-        name = self.names["y"]
+        name, r = self.names["y"], self.record.r
         size = "2 * numpy.pi" if period == 2 * math.pi else f"{period:.0f}"
         what = {2 * math.pi: "2 pi, a turn in radians", 360.0: "360, a turn in degrees"}.get(
             period, f"{size}, the range of a counter of {math.log2(period):.0f} bits"
         )
+        alone = name == "y"
+        cure = f"numpy.unwrap({'record.y' if alone else f'the row of {name}'}, period={size})"
+        also = r is not None and defects.find_wraps(r, self.valid)[0] == period
         text = (
             f"{name} jumps by {what}, at {write_count(len(at), 'sample')}, the first of them "
             f"{at[0]}, and goes on as if it had not: it starts over at the end of its range, and "
-            "the plant does not. Make it continuous, for instance by dataclasses.replace(record, "
-            f"y=numpy.unwrap(record.y, period={size}))."
+            f"the plant does not. Make it continuous by {cure}"
+            f"{', and give dataclasses.replace(record, y=...)' if alone else ''}."
+            f"{' The reference starts over as well: make both continuous.' if also else ''}"
         )
         return [AuditFinding("wrapped", "y", text, len(at), (int(at[0]), int(at[-1]) + 1), True)]
 

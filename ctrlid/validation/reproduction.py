@@ -41,7 +41,7 @@ CLOSED_LOOP = Reproduction("closed-loop simulation")
 # Why a record is predicted and not simulated.
 NO_CONTROLLER = "no controller is given, and the plant alone does not come to rest"
 NO_REFERENCE = "the record lacks a reference of the controller"
-MISSING = "nowhere are all readings known that the controller had"
+MISSING = "no stretch is long enough in which all readings are known that the controller had"
 REJECTED = "the law of the controller is rejected, since it is not what computed the logged input"
 
 

@@ -29,6 +29,10 @@ REPEATED_SHARE = 1e-3
 BLOCKS = 40
 # So many samples tell how large a drift is; of longer records every k-th is used.
 PLENTY = 100_000
+# An angle or a counter that starts over fills this share of its range.
+FULL = 0.9
+# A signal that is computed anew in each period differs by rounding, within this share of its range.
+SAME = 1e-9
 # Where angles start over [rad, deg], and counters of 8 to 32 bits.
 TURNS = (2 * math.pi, 360.0, *(2.0**bits for bits in (8, 10, 12, 14, 16, 24, 32)))
 
@@ -121,12 +125,14 @@ def find_clipped(
 
 
 def find_wraps(v: Array, valid: Any) -> tuple[float, Any]:
-    r"""Return the range at whose ends a signal starts over, and the samples at which it does, or 0.
+    r"""Return the range at whose ends a signal starts over, and where it does.
 
-    .. math:: |\Delta v_k| > P/2, \quad |\Delta v_k \mp P| \le 2 \max_{others} |\Delta v|
+    .. math:: |\Delta v_k| > P/2, \quad \bigl| |\Delta v_k| - P \bigr| \le
+        2 \max_{others} |\Delta v| < P/2
 
-    for a turn in radians or degrees, or the range of a counter of 8 to 32 bits, within which the
-    whole signal lies: an angle or a count that goes on where it seems to jump.
+    for a turn P in radians or degrees, or the range of a counter of 8 to 32 bits, of which the
+    signal fills most and which it does not leave: an angle or a count that goes on where it seems
+    to jump. Where all that jumps returns at once, and from the same number, readings were lost.
 
     Parameters
     ----------
@@ -140,26 +146,32 @@ def find_wraps(v: Array, valid: Any) -> tuple[float, Any]:
     period : float
         The range [signal unit]; 0 for a signal that does not start over.
     at : ndarray of int
-        The samples right after.
+        The samples right after it does.
     """
+    none = np.zeros(0, dtype=int)
     step = np.where(valid[1:] & valid[:-1], np.diff(v), 0.0)
     reach = float(np.ptp(v[valid]))
     for period in TURNS:
         far = np.abs(step) > period / 2
-        if not far.any() or reach > period or reach < 0.9 * period:
-            continue
         usual = float(np.max(np.abs(step[~far]), initial=0.0))
+        # A turn that is rounded to some digits is a little longer.
+        if not (far.any() and FULL * period <= reach <= period + usual and usual > 0):
+            continue
+        at = np.flatnonzero(far) + 1
+        there = at[:-1][(np.diff(at) == 1) & (step[at[1:] - 1] * step[at[:-1] - 1] < 0)]
+        if 2 * len(there) == len(at) and np.ptp(v[there]) == 0:
+            continue  # Readings that were lost, and are all logged as the same number.
         if np.max(np.abs(np.abs(step[far]) - period)) <= 2 * usual < period / 2:
-            return period, np.flatnonzero(far) + 1
-    return 0.0, np.zeros(0, dtype=int)
+            return period, at
+    return 0.0, none
 
 
 def find_exact_period(v: Array) -> int:
-    """Return after how many samples a signal repeats itself to rounding, or 0."""
+    """Return after how many samples a signal repeats itself but for rounding, or 0."""
     period = find_period(v)
     if not period:
         return 0
-    same = np.abs(v[period:] - v[:-period]) <= 4 * estimate_rounding(v)
+    same = np.abs(v[period:] - v[:-period]) <= SAME * float(np.ptp(v))
     return period if same.all() else 0
 
 

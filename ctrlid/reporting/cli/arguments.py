@@ -143,41 +143,66 @@ def import_object(option: str, text: str) -> Any:
         known = f"one of {', '.join(PLANTS)}, " if option == "--model" else ""
         raise CtrlidError(f"{option} is {known}MODULE:NAME or FILE.py:NAME; given {text}")
     try:
-        if module.endswith(".py"):
-            spec = importlib.util.spec_from_file_location(Path(module).stem, module)
-            assert spec is not None
-            assert spec.loader is not None
-            found = importlib.util.module_from_spec(spec)
-            # As if the file were run: it finds its neighbours, and dataclasses their module.
-            sys.modules[spec.name] = found
-            sys.path.insert(0, str(Path(module).resolve().parent))
-            spec.loader.exec_module(found)
-        else:
-            if not {"", os.getcwd()} & set(sys.path):
-                sys.path.insert(0, os.getcwd())
-            found = importlib.import_module(module)
-    except (ModuleNotFoundError, FileNotFoundError) as reason:
-        here = module.endswith(".py") and Path(module).exists()
+        found = _run_file(Path(module)) if module.endswith(".py") else _import_module(module)
+    except ModuleNotFoundError as reason:
         cure = "Give a file, as in plant.py:ball, or a module that Python finds from here"
-        cure = "That file imports it: install it, or put it beside the file" if here else cure
+        if module.endswith(".py") or reason.name != module.partition(".")[0]:
+            cure = "It is imported there: install it, or put it beside the file"
         raise CtrlidError(
             f"{option} {text}: {module} cannot be imported: {reason}. {cure}"
         ) from reason
+    except CtrlidError as reason:
+        raise CtrlidError(f"{option} {text}: {reason}") from reason
     except Exception as reason:
-        # What a user's file does wrong is told in one line, with its place.
-        place = traceback.extract_tb(reason.__traceback__)[-1]
-        words, file, line = str(reason), place.filename, place.lineno
-        if isinstance(reason, SyntaxError):
-            words, file, line = reason.msg, reason.filename or module, reason.lineno
-        raise CtrlidError(
-            f"{option} {text}: {module} cannot be run: {type(reason).__name__}: {words} (line "
-            f"{line} of {file}). Run it by itself, python {module}, until it does"
-        ) from reason
+        raise CtrlidError(f"{option} {text}: {_explain_run(module, reason)}") from reason
     if not hasattr(found, name):
         systems = [k for k, v in vars(found).items() if isinstance(v, (Loop, *SYSTEMS))]
         raise CtrlidError(f"{option} {text}: {module} has no {name}; its python-control "
                           f"systems and loops are {', '.join(systems) or 'none'}")  # fmt: skip
     return getattr(found, name)
+
+
+def _run_file(path: Path) -> Any:
+    """Return the module that a file makes, run as Python runs it: it finds its neighbours.
+
+    Dataclasses look for their module while it runs. Afterwards it is not among the modules, so that
+    its functions go to other processes by value.
+    """
+    if not path.is_file():
+        raise CtrlidError(f"{path} cannot be imported: there is no such file. Give a file, as in "
+                          "plant.py:ball, or a module that Python finds from here")  # fmt: skip
+    spec = importlib.util.spec_from_file_location(f"ctrlid_model_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    found = importlib.util.module_from_spec(spec)
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    sys.modules[spec.name] = found
+    try:
+        spec.loader.exec_module(found)
+    finally:
+        del sys.modules[spec.name]
+    return found
+
+
+def _import_module(name: str) -> Any:
+    """Return a module that Python finds from here."""
+    if not {"", os.getcwd()} & set(sys.path):
+        sys.path.insert(0, os.getcwd())
+    return importlib.import_module(name)
+
+
+def _explain_run(module: str, reason: Exception) -> str:
+    """Say in one line what a user's file does wrong, and at which of its own lines."""
+    frames = traceback.extract_tb(reason.__traceback__)
+    own = [f for f in frames if Path(f.filename).name == Path(module).name] or frames
+    words, line = " ".join(str(reason).split()), own[-1].lineno
+    if isinstance(reason, SyntaxError):
+        words, line = reason.msg, reason.lineno
+    run = module if module.endswith(".py") else f"-m {module}"
+    return (f"{module} cannot be run: {type(reason).__name__}: {words} (line {line}). Run it by "
+            f"itself, python {run}, until it does")  # fmt: skip
 
 
 def _join_names(given: Sequence[Sequence[str]]) -> tuple[str, ...]:
@@ -211,9 +236,11 @@ def parse_assignments(text: str) -> dict[str, str | tuple[str, ...]]:
     """Read NAME=VALUE,NAME=VALUE, or NAME=VALUE,VALUE NAME=VALUE where a name has several."""
     parts: list[str] = []
     for part in filter(str.strip, NEXT_NAME.split(text)):
-        # A name may have blanks in it: what stands before its last word is no pair yet.
-        whole = parts and "=" not in parts[-1]
-        parts[-1:] = [f"{parts[-1]} {part}"] if whole else [*parts[-1:], part]
+        # A name may have blanks in it: what has no value yet goes on.
+        if parts and "=" not in parts[-1]:
+            parts[-1] += f" {part}"
+        else:
+            parts.append(part)
     pairs = [part.partition("=") for part in parts]
     if not pairs or not all(key.strip() and equal and value for key, equal, value in pairs):
         raise argparse.ArgumentTypeError(f"needs NAME=VALUE,NAME=VALUE; given {text}")
