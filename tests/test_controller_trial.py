@@ -419,3 +419,14 @@ def test_the_limits_of_the_former_pid_stay_those_of_the_input():
     held = cid.Loop(ball, cid.PID(kp=-3e3, kd=-60.0, lower=0.0, upper=12.0), dt=0.001, at=at)
     lead = cid.redesign(cid.linearize(ball, at), held, crossover=100, phase_margin=50)
     assert lead.loop.input_limits == (0.0, 12.0)
+
+
+@pytest.mark.parametrize("square", [1.0, 7.0, 16.0, 1234.5])
+def test_an_undamped_plant_has_its_margins(square):
+    """The grid of frequencies has its pole exactly, where numpy refuses to solve."""
+    P = ct.ss([[0, 1], [-square, 0]], [[0], [1]], [[1, 0]], 0, inputs="u", outputs="y")
+    loop = cid.Loop(P, None, dt=0.1 / np.sqrt(square))
+    w = np.sqrt(square)
+    law = ct.tf([3.0 * square, 4.0 * w * square], [1.0, 10.0 * w])
+    found = cid.redesign(P, loop, design=lambda P: law)
+    assert found.stable

@@ -4,6 +4,7 @@ Groups: PID by hand; other forms of the same controller; refusals; real logs.
 """
 
 import math
+from dataclasses import replace
 
 import casadi
 import control as ct
@@ -425,3 +426,47 @@ def test_names_that_do_not_say_which_input_is_the_output_are_refused():
     with pytest.raises(CtrlidError, match=r"only input is called x, .* acts on r - y"):
         end_with(["x"], [-0.5])
     assert end_with(["e"], [0.5]) == pytest.approx(end_with(["r", "x"], [0.5, -0.5]))
+
+
+def two_degrees(names, dt=None):
+    """A lead of y, and seven tenths of it of r, on the servo below; the order is that of names."""
+    A = ct.ss(ct.tf([8.0, 40.0], [1.0, 10.0]))
+    r, y = (0.7 * A.B, 0.7 * A.D), (-A.B, -A.D)
+    first, second = (r, y) if names[0].startswith("r") else (y, r)
+    law = ct.ss(A.A, np.hstack([first[0], second[0]]), A.C, np.hstack([first[1], second[1]]))
+    law = law if dt is None else ct.sample_system(law, dt, "bilinear")
+    return ct.ss(law.A, law.B, law.C, law.D, law.dt, inputs=names, outputs="V")
+
+
+ORDERS = [["r", "y"], ["y", "r"], ["y", "ref"], ["x", "r"], ["ref", "x"]]
+
+
+@pytest.mark.parametrize("names", ORDERS, ids=",".join)
+@pytest.mark.parametrize("dt", [None, 0.01])
+def test_all_read_the_inputs_of_a_controller_in_the_same_order(names, dt):
+    """`audit`, `compare` and `fit_iv` knew only (y, r): other names were blamed or not used."""
+    servo = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    law = two_degrees(names, dt)
+    loop = cid.Loop(servo, law, dt=0.01)
+    r = cid.random_binary(1200, amplitude=0.1, hold=50, around=0.3, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
+    assert not cid.audit(record, loop).harmful
+    assert "closed-loop simulation" in [c.label for c in cid.compare(record, loop).curves]
+    if dt is None:
+        return
+    G = cid.fit_iv(record, na=2, nb=2, controller=law)
+    assert any("simulation with the given controller" in note for note in (str(G.estimate),))
+    louder = ct.ss(law.A, law.B, 1.5 * law.C, 1.5 * law.D, 0.01, inputs=names, outputs="V")
+    wrong = cid.Loop(servo, louder, dt=0.01)
+    assert [f.kind for f in cid.audit(record, wrong).harmful] == ["gain"]
+
+
+def test_a_masked_input_is_beyond_no_limit():
+    servo = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    loop = cid.Loop(servo, cid.PID(kp=5.0, kd=0.3), dt=0.01, input_limits=(-30.0, 30.0))
+    r = cid.random_binary(900, amplitude=0.1, hold=50, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
+    u = np.where(np.arange(900) == 500, 100.0, record.u)
+    masked = replace(record, u=u, valid=np.arange(900) != 500)
+    assert not cid.audit(masked, loop)["limit"]
+    assert cid.audit(replace(record, u=u), loop)["limit"]

@@ -239,3 +239,19 @@ def test_a_diagnosis_on_a_dask_cluster_finds_the_same():
     alone = cid.diagnose(model, record, **few)
     assert [f.name for f in spread.findings] == [f.name for f in alone.findings] == ["ActuatorLag"]
     assert spread.loop.parameters == alone.loop.parameters
+
+
+def test_a_line_through_two_exact_poles_has_no_error_that_is_known():
+    """It was made up of two ones: 353 of a unit for a slope of zero."""
+    records = []
+    for seed, gap in ((1, 0.010), (2, 0.014)):
+        plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+        at = cid.operating_point(plant, output=gap)
+        C = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
+        loop = cid.Loop(plant, C.sample(0.001, "tustin"), dt=0.001, at=at)
+        r = cid.random_binary(1000, amplitude=1e-4, hold=20, around=gap, seed=seed)
+        records.append(cid.simulate(loop, r, sensor_noise=1e-6, seed=seed))
+    known = [cid.Fixed("a1", -2.002), cid.Fixed("a2", 1.0)]
+    trend = cid.fit_each(cid.fit_iv, records, na=2, nb=2, constraints=known).trend
+    assert np.isnan(trend.pole_error)
+    assert np.isnan(trend.slope_error)

@@ -167,3 +167,32 @@ def test_a_fit_and_a_diagnosis_find_the_delay_and_its_place(place, delay):
     assert isinstance(finding.effect, E.InputDelay)
     assert finding.effect.at == INPUTS[place]
     assert f"InputDelay at {INPUTS[place]};" in repr(found)
+
+
+FEEDTHROUGH = ct.tf([0.5, 1.0, 2.0], [1.0, 1.2, 4.0])
+
+
+@pytest.mark.parametrize("delay", [0.1, 0.2, 0.25])
+def test_what_passes_through_at_once_comes_late_as_well(delay):
+    """The output had the part of the input that passes through as it was computed, not late."""
+    loop = cid.Loop(FEEDTHROUGH, None, dt=0.1)
+    d = np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 20), 5)
+    late = cid.simulate(loop.with_effect(E.InputDelay(delay=delay)), d=d).y
+    fine = cid.Loop(FEEDTHROUGH, None, dt=0.05)
+    shifted = np.concatenate([np.zeros(round(delay / 0.05)), np.repeat(d, 2)])[: 2 * len(d)]
+    expected = cid.simulate(fine, d=shifted).y[::2]
+    np.testing.assert_allclose(late, expected, atol=1e-9)
+
+
+def test_a_backlash_takes_its_part_of_what_passes_through():
+    loop = cid.Loop(FEEDTHROUGH, None, dt=0.1).with_effect(E.InputBacklash(width=0.4))
+    d = np.where(np.arange(20) < 3, 0.0, 1.0)
+    assert cid.simulate(loop, d=d).y[3] == pytest.approx(0.5 * 0.8)
+
+
+def test_a_comparison_with_a_late_input_does_not_contradict_itself():
+    loop = cid.Loop(FEEDTHROUGH, None, dt=0.1).with_effect(E.InputDelay(delay=0.2))
+    d = cid.random_binary(1000, amplitude=1.0, hold=20, seed=1)
+    record = cid.simulate(loop, d=d, sensor_noise=1e-2, seed=1)
+    found = cid.compare(record, loop)
+    assert min(c.fit for c in found.curves) > 97.0

@@ -22,6 +22,7 @@ from ctrlid.diagnosis.screening import screen_at
 from ctrlid.diagnosis.several_records import _merge_gaps
 from ctrlid.diagnosis.thresholds import vary_numbers
 from ctrlid.estimation.likelihood.likelihood import make_problem
+from ctrlid.validation.controller_check import take_bias_from_log
 
 PID = cid.PID(kp=8.0, kd=1.0)
 
@@ -334,3 +335,15 @@ def test_readings_beyond_a_known_limit_are_not_taken_out():
     found = cid.diagnose(servo(wrong), record, catalogue=FEW, progress=False)
     assert found.gap.after > 5 * found.gap.floor
     assert found.calibrated[0].after == pytest.approx(3.0, abs=0.05)
+
+
+def test_a_masked_reading_does_not_lead_a_replay_astray():
+    """With an integral it erred by half of what u moves, before the reading as well."""
+    loop = servo(controller=cid.PID(kp=5.0, ki=1.0, kd=0.3), dt=0.01)
+    record = record_of(loop, 1000, amplitude=0.1, around=0.0, noise=1e-4)
+    y = np.where(np.arange(1000) == 500, 50.0, record.y)
+    masked = replace(record, y=y, valid=np.arange(1000) != 500)
+    left = cid.replay_controller(loop, masked) - record.u
+    assert np.abs(left[:499]).max() < 1e-3 * np.std(record.u)
+    assert np.abs(left[510:]).max() < 1e-9
+    assert take_bias_from_log(loop, masked).point.input == pytest.approx(0.0, abs=1e-3)

@@ -496,3 +496,16 @@ def test_the_report():
 def test_refusals(call, words):
     with pytest.raises(CtrlidError, match=words):
         call()
+
+
+@pytest.mark.parametrize(
+    ("num", "den", "crossover", "margin", "final"),
+    [([1, 0.005], np.polymul([1, 0.1, 0], [0.02, 1]), 1.0, 95, 1.0),
+     ([1], [1, 0.02, 1], 1.02, 30, 0.04104)],
+)  # fmt: skip
+def test_a_step_lasts_until_the_slowest_pole_has_settled(num, den, crossover, margin, final):
+    """After 60 / crossover the first was at 0.93, and was said to have settled in 7 s."""
+    G = ct.tf(num, den)
+    found = cid.redesign(G, cid.Loop(G, None, dt=0.02), crossover=crossover, phase_margin=margin)
+    assert found.promised.final_value == pytest.approx(final, rel=0.003)
+    assert found.promised.settling_time > 100.0

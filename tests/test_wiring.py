@@ -336,3 +336,54 @@ def test_a_loop_that_diverges_is_explained():
     C = ct.ss([], [], [], [[5.0, 0.0]], DT, inputs=["x", "theta"])
     with pytest.raises(cid.CtrlidError, match="closed loop is unstable: small deviations grow"):
         cid.simulate(cid.Loop(CART, C, dt=DT), d=np.zeros(20000), initial=[0, 1e-6, 0, 0])
+
+
+CHAIN = ct.nlsys(lambda t, x, u, p: [-x[0] + u[0], -x[1] + 0.5 * x[0]], lambda t, x, u, p: x,
+                 inputs=["F"], outputs=["a", "b"], states=["x1", "x2"], name="chain")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("names", "b", "references"),
+    [
+        (["ref", "a"], [[0.05, -0.05]], (1.08,)),
+        (["ref", "b"], [[0.05, -0.05]], (0.54,)),
+        (["rb", "ra", "b", "a"], [[0.05, 0, -0.05, 0], [0, 0.05, 0, -0.05]], (0.54, 1.08)),
+    ],
+)
+def test_an_integrator_rests_where_its_outputs_are(names, b, references):
+    """Its reference was zero, or that of another output, and its state ran away to 1e13."""
+    n = len(b)
+    law = ct.ss(np.eye(n), b, [[0.3, 0.2][:n]], 0.1 * np.sign(np.sum(b, axis=0))[None], 0.05,
+                inputs=names, outputs="F")  # fmt: skip
+    at = cid.operating_point(CHAIN, output=[1.08, 0.54])
+    loop = cid.Loop(CHAIN, law, dt=0.05, at=at)
+    assert loop.law().references == pytest.approx(references)
+    r = np.repeat(np.array(references)[:, None], 50, axis=1)
+    record = cid.simulate(loop, r[0] if n == 1 else r)
+    assert np.ptp(record.y, axis=1).max() < 1e-9
+
+
+def test_a_controller_without_a_rest_begins_at_zero():
+    law = ct.ss([[1.0]], [[0.05, 0.05, -0.05]], [[0.3]], [[0.1, 0.1, -0.1]], 0.05,
+                inputs=["one", "two", "a"], outputs="F")  # fmt: skip
+    at = cid.operating_point(CHAIN, output=[1.08, 0.54])
+    assert np.abs(cid.Loop(CHAIN, law, dt=0.05, at=at).law().rest).max() < 100.0
+
+
+def test_a_wrong_observer_of_a_plant_with_one_output_is_told():
+    """It has three inputs, whose names were lost where its gain was tried."""
+    plant = ct.ss([[0, 1], [-3, -2]], [[0], [1]], [[1, 0]], 0, inputs="V", outputs="x", name="st")
+    d = ct.sample_system(plant, 0.02)
+    K, L = np.array([[4.0, 1.0]]), ct.dlqe(d.A, np.eye(2), d.C, np.eye(2), np.eye(1))[0]
+    law = ct.ss(d.A - L @ d.C, np.hstack([L, d.B, np.zeros((2, 1))]), -K, [[0, 0, 5.0]], 0.02,
+                inputs=["x", "V", "r"], outputs="V")  # fmt: skip
+    loop = cid.Loop(plant, law, dt=0.02)
+    record = cid.simulate(loop, cid.random_binary(800, amplitude=1.0, hold=40, seed=1),
+                          sensor_noise=1e-3, seed=2)  # fmt: skip
+    louder = ct.ss(
+        law.A, law.B, 1.3 * law.C, 1.3 * law.D, 0.02, inputs=["x", "V", "r"], outputs="V"
+    )
+    wrong = cid.Loop(plant, louder, dt=0.02)
+    assert not cid.audit(record, loop).harmful
+    assert cid.audit(record, wrong).harmful
+    assert "prediction" in cid.compare(record, wrong).curves[0].label

@@ -408,7 +408,7 @@ def split_unit(label: str) -> tuple[str, str]:
     >>> split_unit("Zeit/ms"), split_unit("speed/(m/s)"), split_unit("up/down")
     (('Zeit', 'ms'), ('speed', 'm/s'), ('up/down', ''))
     """
-    found = re.fullmatch(r"(.*\S)(\s*)\[([^\[\]]*)\]|(.*\S)(\s*)\(([^()]*)\)", label)
+    found = re.fullmatch(r"(.*\S)(\s*)\[([^\[\]]*)\]|(.*[^\s/])(\s*)\(([^()]*)\)", label)
     if found is None:
         quantity, slash, unit = label.partition("/")
         if slash and quantity.strip() and is_unit(unit):

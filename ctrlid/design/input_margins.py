@@ -25,6 +25,8 @@ REAL = 1e-3
 
 # A pole this share of the fastest one, or nearer to zero, is at zero but for rounding.
 ROUNDED = 1e-9
+# A point on a pole is moved off it by this share.
+NUDGE = 1e-9
 
 
 def open_at_inputs(loop: Loop) -> Any:
@@ -172,6 +174,12 @@ class _Response:
     def __call__(self, omega: npt.ArrayLike) -> ComplexArray:
         w = np.atleast_1d(np.asarray(omega, dtype=float))
         points = np.exp(1j * w * self.dt) if self.dt else 1j * w
+        # On an undamped pole itself the response is infinite.
+        poles = np.linalg.eigvals(self.a)
+        near = np.abs(points[:, None] - poles).min(axis=1, initial=math.inf)
+        points = points + np.where(near < NUDGE * np.maximum(np.abs(points), 1.0), NUDGE, 0.0) * (
+            np.maximum(np.abs(points), 1.0)
+        )
         pencil = points[:, None, None] * np.eye(len(self.a)) - self.a
         states = np.linalg.solve(pencil, np.broadcast_to(self.b[:, None], (len(w), len(self.b), 1)))
         return np.asarray((self.c @ states)[:, 0], dtype=complex)

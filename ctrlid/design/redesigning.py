@@ -17,7 +17,7 @@ from .._base.signals import require_one_signal
 from .._base.text import Printed, write_polynomial, write_quantity
 from ..estimation.identified_model import IdentifiedModel, IdentifiedSystem
 from ..estimation.likelihood.physics_estimate import LoopFit, linearize_at_rest
-from ..loop.loop import Loop, find_input_limits
+from ..loop.loop import Loop, describe_other_output, find_input_limits
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.conversions import sample_held, to_transfer_function
@@ -29,6 +29,12 @@ from .margins import loop_margins, nu_gap, robust_margin
 from .reference_steps import LOST, write_sentence
 from .settling import SETTLED, TAIL, explain_unsettled, settles_otherwise
 from .step_height import StepHeight, advise_step, choose_height, try_heights
+
+# A step response lasts so many radians at the crossover, and so many time constants of its slowest
+# pole; poles slower than this share of the crossover are not waited for.
+WAVES, LASTING, SLOWEST = 60.0, 8.0, 1e-3
+# It has so many samples at most.
+LONGEST = 50_000
 
 
 @dataclass(frozen=True)
@@ -351,7 +357,7 @@ def redesign(
     if not isinstance(loop, Loop):
         raise CtrlidError("redesign needs a Loop, on which the controller is tried; given "
                           f"{type(loop).__name__}{point_at_part(loop, Loop)}")  # fmt: skip
-    other = loop.describe_other_output()
+    other = describe_other_output(loop)
     if other:
         # The controller would be tried about another point than that which it was designed for.
         given = ", ".join(f"{y:.4g}" for y in loop.point.outputs)
@@ -386,7 +392,7 @@ def redesign(
     if dt and not timebase(P):
         P = sample_held(P, dt)
     # The response is long enough for the slowest promised pole, at the sampling period of the loop.
-    length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
+    length = _choose_length(ct.poles(ct.feedback(G * C, 1)), dt, crossover, trial.dt)
     time: Array = np.arange(length, dtype=float) * trial.dt
     promised_step = _simulate_linear_step(ct.feedback(G * C, 1), time)
     chosen = _choose_height(
@@ -514,3 +520,12 @@ def _measure_performance(margins: Any, time: Array, response: Array) -> Performa
     return Performance(margins.stable, margins.phase_margin, margins.gain_margin,
                        margins.gain_reduction_margin, margins.crossover, overshoot, settling,
                        final)  # fmt: skip
+
+
+def _choose_length(poles: Any, sampled: float, crossover: float, dt: float) -> int:
+    """Return how many samples a step response lasts: until the slowest pole has settled."""
+    with np.errstate(divide="ignore"):
+        rates = -(np.log(poles.astype(complex)) / sampled if sampled else poles).real
+    # A pole a thousand times as slow as the crossover is not waited for.
+    slowest = float(np.min(rates[rates > SLOWEST * crossover], initial=math.inf))
+    return int(np.clip(max(WAVES / crossover, LASTING / slowest) / dt, 20, LONGEST))

@@ -124,7 +124,9 @@ class FitSeries(_text.Printed):
         slope = float(weight @ ((y - level) * (p - pole)) / width)
         square = float(weight @ (p - pole - slope * (y - level)) ** 2)
         degrees = len(y) - 2
-        scale = square / degrees if degrees else 1.0
+        # Poles without errors of their own scatter about a line of three or more, and tell no
+        # error of one through two.
+        scale = square / degrees if degrees else float("nan") if exact else 1.0
         scale = scale if exact else max(scale, 1.0)
         chance = float(chi2.sf(square, degrees)) if degrees and not exact else float("nan")
         slope_error = float(np.sqrt(scale / width))

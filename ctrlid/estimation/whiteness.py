@@ -39,7 +39,8 @@ def note_coloured_innovations(
     stretches : sequence of ndarray
         Innovations, each stretch without a gap; NaN where there are none.
     fitted : int
-        Number of coefficients fitted to these data.
+        Number of coefficients that take a degree of freedom each: those of the dynamics of the
+        noise. What multiplies the past of other signals takes none.
     consequence : str
         What follows for the estimate, as a sentence.
     size : float, optional

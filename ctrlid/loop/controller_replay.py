@@ -1,7 +1,7 @@
 """The input that a loop's controller computes from recorded signals."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -16,8 +16,10 @@ from .._base.periods import have_same_period, write_both_periods, write_differen
 from .._base.rounding import keep_numpy_quiet
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
+from ..data.validity import find_last_valid
 from ..physics.block_evaluation import BlockEvaluation
 from ..physics.conversions import to_state_matrices
+from .controllers import find_input_order
 from .loop import Loop, exchange_controller, exchange_limits
 from .wiring import knows_references, match_signals, stack_references
 
@@ -143,6 +145,7 @@ def replay_controller(loop: Loop, record: Record) -> Array:
     The controller's initial state is not in the record; it is chosen to reproduce the logged u
     best. What then remains between the result and ``record.u`` is not the controller's: injected
     pulses or dither, a channel logged late, another controller. An observer reads the logged u.
+    Where a reading does not count, the last one that does stands for it.
 
     Parameters
     ----------
@@ -210,8 +213,9 @@ def sample_analog_controller(loop: Loop, hold_r: str, hold_y: str) -> Loop | Non
     a, b, c, d = to_state_matrices(law)
     if law.ninputs == 1:
         b, d = np.hstack([b, -b]), np.hstack([d, -d])
-    elif list(law.input_labels) == ["y", "r"]:
-        b, d = b[:, ::-1], d[:, ::-1]
+    else:
+        order = list(find_input_order(law, loop.equations().outputs[0]))
+        b, d = b[:, order], d[:, order]
     n, dt = len(a), loop.dt
     # The input is a signal and its slope over the period.
     block = np.zeros((n + 4, n + 4))
@@ -234,6 +238,7 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     if not knows_references(loop.wiring, record):
         raise ModelCannotRun("the record has no reference r, which the controller needs; give it "
                               "r=, a constant for a fixed set-point")  # fmt: skip
+    record = _hold_readings(record)
     r = read_references(loop, record)
     run = _build_controller_run(loop, record.y, r, record.u)
     start = run.rest
@@ -242,14 +247,14 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
         # From the wrong state all may be cut off, and the state is then nowhere to be seen.
         unlimited = exchange_limits(loop)
         low, high = (np.reshape(v, (-1, 1)) if np.ndim(v) else v for v in loop.input_limits)
-        inside = np.ravel((record.u > low) & (record.u < high))
+        inside = np.ravel((record.u > low) & (record.u < high) & record.valid_somewhere)
         free = _build_controller_run(unlimited, record.y, r, record.u)
         moved = _take_gauss_newton_step(free, start, record.u, inside)
         trial, cost = _compare_inputs(run, moved, record)
         if cost < best:
             start, replayed, best = moved, trial, cost
     # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
-    every = np.full(record.u.size, True)
+    every = np.broadcast_to(record.valid_somewhere, np.shape(record.u)).ravel()
     for _ in range(10 if start.size else 0):
         moved = _take_gauss_newton_step(run, start, record.u, every)
         trial, cost = _compare_inputs(run, moved, record)
@@ -270,7 +275,21 @@ def differentiate_replay(loop: Loop, record: Record) -> tuple[Array, Array, floa
 def _compare_inputs(run: _ControllerRun, start: Array, record: Record) -> tuple[Array, float]:
     """Return what a controller computes from a state, and how far the logged input is from it."""
     replayed = run.compute_outputs(start)
-    return replayed, float(np.sum((replayed - record.u) ** 2))
+    left = np.where(record.valid_somewhere, replayed - record.u, 0.0)
+    return replayed, float(np.sum(left**2))
+
+
+def _hold_readings(record: Record) -> Record:
+    """Return a record in which each output keeps its last value where it does not count.
+
+    What a controller remembers is not led astray by a reading that was none.
+    """
+    each = np.reshape(record.valid_outputs, (-1, len(record)))
+    if each.all() or not each.any(axis=1).all():
+        return record
+    rows = zip(np.reshape(record.y, (-1, len(record))), each, strict=True)
+    y = np.array([row[find_last_valid(use)] for row, use in rows])
+    return replace(record, y=y.reshape(np.shape(record.y)))
 
 
 def _take_gauss_newton_step(run: _ControllerRun, start: Array, u: Array, use: Any) -> Array:

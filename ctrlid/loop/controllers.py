@@ -200,7 +200,7 @@ def make_control_law(
     if sampled and not have_same_period(sampled, dt):
         both = write_both_periods("the controller runs", sampled, "the loop", dt)
         raise CtrlidError(f"{both}; convert it to the period of the loop")
-    order = _find_input_order(list(controller.input_labels), output)
+    order = find_input_order(controller, output)
     if isinstance(controller, ct.TransferFunction | ct.StateSpace):
         if isinstance(controller, ct.TransferFunction):
             require_proper(controller)
@@ -210,12 +210,30 @@ def make_control_law(
     return _make_traced_law(controller, at, dt if sampled else 0.0, order)
 
 
-def _find_input_order(names: list[str], output: str) -> tuple[int, int]:
+def find_input_order(controller: Any, *outputs: str) -> tuple[int, int]:
     """Return where (r, y) are among a controller's inputs, as the names of these say.
 
     Without names the reference comes first.
+
+    Parameters
+    ----------
+    controller : control.InputOutputSystem
+        A controller with one or two inputs.
+    *outputs : str
+        What the output of the plant is called, besides y.
+
+    Returns
+    -------
+    (int, int)
+        Places of r and y.
+
+    Raises
+    ------
+    CtrlidError
+        If the names do not say which of two inputs is y.
     """
-    measured = [name in (output, "y", "y[0]") for name in names]
+    names, output = list(controller.input_labels), (*outputs, "y")[0]
+    measured = [name in (*outputs, "y", "y[0]") for name in names]
     if len(names) == 1:
         if measured[0] and names[0] != "e":
             raise CtrlidError(

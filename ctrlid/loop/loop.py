@@ -555,7 +555,7 @@ class Loop(Printed):
         pairs = zip((*e.outputs, *e.inputs), (*self.at.outputs, *self.at.inputs), strict=True)
         point = ", ".join(f"{name} = {value:g}" for name, value in pairs)
         text = f"Loop({e.name}, {kind}, dt={self.dt:g} s, at {point}"
-        other = self.describe_other_output()
+        other = describe_other_output(self)
         text += f" (THE OUTPUT IS ANOTHER: {other})" if other else self._describe_imbalance()
         limits = np.broadcast_to(np.array(np.broadcast_arrays(*self.input_limits)).T,
                                  (len(e.inputs), 2))  # fmt: skip
@@ -583,24 +583,6 @@ class Loop(Printed):
         if not list_unforced_velocities(e):
             return write_loop(self)
         return f"{write_loop(self)}\n  note: {describe_missing_forces(e, self.point)}."
-
-    def describe_other_output(self) -> str:
-        """Say what the plant shows at the states of the operating point, if not the output there.
-
-        Empty where both agree. The parameters of a sensor, which a fit may change, are a reason why
-        they need not agree exactly.
-        """
-        if self.linear_plant:
-            return ""
-        at, e = self._bare_point, self._traced
-        shown = e.evaluate(np.array(at.states), np.array(at.inputs))[1]
-        small = 1e-3 * max(map(abs, at.states), default=0.0)
-        others = [
-            f"{name} = {there:g}"
-            for name, given, there in zip(e.outputs, at.outputs, shown.tolist(), strict=True)
-            if abs(given - there) > OTHER_OUTPUT * max(abs(given), abs(there)) + small
-        ]
-        return f"at these states the plant shows {', '.join(others)}" if others else ""
 
     def _describe_imbalance(self) -> str:
         """Say that the plant does not rest at the operating point; empty where it does.
@@ -633,6 +615,25 @@ class _Itself:
 def _add_effect(loop: Loop, effect: _Itself) -> Loop:
     """Return a loop with one more effect; the last ones are kept."""
     return loop._replace_fields(effects=(*loop.effects, effect.given))
+
+
+def describe_other_output(loop: Loop) -> str:
+    """Say what the plant shows at the states of the operating point, if not the output there.
+
+    Empty where both agree. The parameters of a sensor, which a fit may change, are a reason why
+    they need not agree exactly.
+    """
+    if loop.linear_plant:
+        return ""
+    at, e = loop._bare_point, loop._traced
+    shown = e.evaluate(np.array(at.states), np.array(at.inputs))[1]
+    small = 1e-3 * max(map(abs, at.states), default=0.0)
+    others = [
+        f"{name} = {there:g}"
+        for name, given, there in zip(e.outputs, at.outputs, shown.tolist(), strict=True)
+        if abs(given - there) > OTHER_OUTPUT * max(abs(given), abs(there)) + small
+    ]
+    return f"at these states the plant shows {', '.join(others)}" if others else ""
 
 
 def exchange_controller(loop: Loop, controller: Any) -> Loop:

@@ -179,8 +179,6 @@ def make_period_map(
     slope = None
     y = measure_output(t0, z, u_rest)
     u, moved = compute_input(t0, z[: n + nc], y)
-    if law is None:
-        y = measure_output(t0, z, u)
     if loop.analog:
         if kept or e.memory is not None:
             raise EffectDoesNotApply(
@@ -223,10 +221,14 @@ def make_period_map(
             for k in range(pieces)
             for piece in cut_input(e, loop.dt / pieces, known[k : k + 3], hold)
         ]
+        straight = _insert_values(e, straight, p)
+        if law is None:
+            # What passes through at once is the input that acts, and not the one that is computed.
+            (lasting, acting, _), *later = straight
+            acting = casadi.if_else(lasting > 0, acting, later[0][1]) if later else acting
+            y = measure_output(t0, z, acting)
         scheme = Scheme(8, substeps, sharp=(8, substeps))
-        x, error = advance(
-            e, t0, z[:n], _insert_values(e, straight, p), p, None, held_rate, scheme=scheme
-        )
+        x, error = advance(e, t0, z[:n], straight, p, None, held_rate, scheme=scheme)
         after = casadi.vertcat(x, moved, memory)
         if kept:
             newest = [value[e.late_input] for value in reversed(applied)]

@@ -14,6 +14,7 @@ from .._base.text import write_list, write_percent
 from ..data.record import Record
 from ..data.validity import find_longest_run
 from ..physics.conversions import to_state_matrices
+from .controllers import find_input_order
 
 # Shorter stretches do not tell what computed the input.
 FEWEST = 20
@@ -50,7 +51,7 @@ class SampledForm:
     analog: float
 
 
-def find_sampled_form(controller: Any, record: Record) -> SampledForm | None:
+def find_sampled_form(controller: Any, record: Record, *outputs: str) -> SampledForm | None:
     """Return the sampled form of an analog controller that computed a logged u.
 
     Between samples nothing is known of r and y. To a sampled controller this makes no difference,
@@ -64,6 +65,8 @@ def find_sampled_form(controller: Any, record: Record) -> SampledForm | None:
         The stated controller of r - y, or of r and y.
     record : Record
         The record.
+    *outputs : str
+        What the output is called, besides y and its name in the record.
 
     Returns
     -------
@@ -79,19 +82,22 @@ def find_sampled_form(controller: Any, record: Record) -> SampledForm | None:
         return None
     if record.r is None or any(np.ndim(s) != 1 for s in (record.r, record.u, record.y)):
         return None
+    names = (*outputs, *record.signals["y"][:1])
     part = record[find_longest_run(record.valid)][:MOST] if record.valid.any() else record[:MOST]
     # What a limit cut off lies at the ends of u, and is no output of a linear law.
     inside = (part.u > part.u.min()) & (part.u < part.u.max())
     if np.count_nonzero(inside) < FEWEST:
         return None
     with np.errstate(all="ignore"):
-        analog = min(_measure_left(run, part, inside) for run in _run_analog(controller, part))
+        analog = min(
+            _measure_left(run, part, inside) for run in _run_analog(controller, part, *names)
+        )
         if not to_state_matrices(controller)[0].size:
             known = record.hold == "zoh" and analog <= EXACT
             return SampledForm("", analog, analog) if known else None
         sampled = [
             SampledForm(rule, _measure_left(_run(law, part), part, inside), analog)
-            for rule, law in _list_sampled(controller, part.dt)
+            for rule, law in _list_sampled(controller, part.dt, *names)
         ]
     best = min(sampled, key=lambda form: form.left)
     return best if best.left <= min(REPLAYED, CLEARLY * analog) else None
@@ -146,13 +152,16 @@ def note_sampled_controller(
     return ()
 
 
-def _read_matrices(controller: Any) -> tuple[Array, Array, Array, Array]:
-    """Return the state matrices of a controller as one with the inputs r and y."""
+def _read_matrices(controller: Any, *outputs: str) -> tuple[Array, Array, Array, Array]:
+    """Return the state matrices of a controller as one with the inputs r and y.
+
+    Besides y the measurement may have the names of outputs.
+    """
     a, b, c, d = to_state_matrices(controller)
     if controller.ninputs == 1:
         return a, np.hstack([b, -b]), c, np.hstack([d, -d])
-    swap = list(controller.input_labels) == ["y", "r"]
-    return (a, b[:, ::-1], c, d[:, ::-1]) if swap else (a, b, c, d)
+    order = list(find_input_order(controller, *outputs))
+    return a, b[:, order], c, d[:, order]
 
 
 def _discretize(matrices: Any, dt: float, method: Any) -> Any:
@@ -160,9 +169,9 @@ def _discretize(matrices: Any, dt: float, method: Any) -> Any:
     return signal.cont2discrete(matrices, dt, method)[:4]
 
 
-def _list_sampled(controller: Any, dt: float) -> Iterator[tuple[str, Any]]:
+def _list_sampled(controller: Any, dt: float, *outputs: str) -> Iterator[tuple[str, Any]]:
     """Yield the rules of sampling and the state matrices that they make."""
-    matrices = _read_matrices(controller)
+    matrices = _read_matrices(controller, *outputs)
     for rule, method in RULES.items():
         try:
             yield rule, _discretize(matrices, dt, method)
@@ -176,9 +185,9 @@ def _list_sampled(controller: Any, dt: float) -> Iterator[tuple[str, Any]]:
             yield "matched", _read_matrices(matched)
 
 
-def _run_analog(controller: Any, record: Record) -> Iterator[Array]:
+def _run_analog(controller: Any, record: Record, *outputs: str) -> Iterator[Array]:
     """Yield what the analog law makes of a straight y, and of an r that is held or straight."""
-    matrices = _read_matrices(controller)
+    matrices = _read_matrices(controller, *outputs)
     if not matrices[0].size:
         yield _run(matrices, record)
         return

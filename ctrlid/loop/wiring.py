@@ -508,19 +508,22 @@ def make_wired_law(controller: Any, wiring: Wiring, at: OperatingPoint, dt: floa
         wish, moved = law(t, x, r, y, u)
         return wish, moved
 
-    held = [_default_reference(name, v, k, at, wiring)
-            for k, (name, v) in enumerate(zip(wiring.open, wiring.held, strict=True))]  # fmt: skip
+    held = [_default_reference(v, k, at, wiring) for k, v in enumerate(wiring.held)]
     rest = _find_rest(law, np.array(held), at, bool(sampled), controller, dt)
     return ControlLaw(dt if sampled else 0.0, tuple(rest.tolist()), apply, tuple(held),
                       wiring.reads_input)  # fmt: skip
 
 
-def _default_reference(
-    name: str, value: float | None, k: int, at: OperatingPoint, wiring: Wiring
-) -> float:
-    """Return the value of an open input at rest; a reference by position is that of its output."""
+def _default_reference(value: float | None, k: int, at: OperatingPoint, wiring: Wiring) -> float:
+    """Return the value of an open input at rest: that of the output which it is a reference for.
+
+    By position, or the one that the controller reads at the same place among its outputs.
+    """
     if value is not None:
         return value
+    read = list(dict.fromkeys(i for kind, i in wiring.inputs if kind == "y"))
+    if not any(kind == "e" for kind, _ in wiring.inputs) and len(read) == len(wiring.open):
+        return at.outputs[read[k]]
     by_position = any(kind == "e" for kind, _ in wiring.inputs) or len(wiring.open) == len(
         at.outputs
     )
@@ -589,5 +592,9 @@ def _find_rest(
     ends = [np.concatenate([np.asarray(a, float).ravel(), np.asarray(b, float).ravel() - target])
             for a, b in (f(v)[::2] for v in (x, better))]  # fmt: skip
     size = 1.0 + float(np.max(np.abs(target), initial=0.0))
-    found = better if np.max(np.abs(ends[1])) < AT_REST * size else x
+    if np.max(np.abs(ends[1])) < AT_REST * size:
+        found = better
+    else:
+        # One that moves on for ever, as an integrator whose reference is elsewhere, has no rest.
+        found = x if np.max(np.abs(ends[0][:n])) < AT_REST * size else np.zeros(n)
     return np.where(np.abs(found) < 1e-14, 0.0, found)

@@ -185,6 +185,14 @@ def measure_opposite_sign(loop: Loop, record: Record) -> tuple[float, float]:
     return float(found[0]), 1 - left / most
 
 
+def scale_controller(controller: Any, factor: Any) -> Any:
+    """Return so many times a linear controller, which keeps the names of its signals."""
+    scaled = factor * controller
+    if isinstance(controller, ct.InputOutputSystem):
+        scaled.update_names(inputs=controller.input_labels, outputs=controller.output_labels)
+    return scaled
+
+
 def _scale_controller(loop: Loop, factor: float, constant: float) -> Loop | None:
     """Return the loop with so many times its controller, about another constant input."""
     controller = loop.controller
@@ -193,7 +201,8 @@ def _scale_controller(loop: Loop, factor: float, constant: float) -> Loop | None
                         kd=factor * controller.kd, bias=constant)  # fmt: skip
         return exchange_controller(loop, other)
     if isinstance(controller, ct.TransferFunction | ct.StateSpace | int | float):
-        return exchange_constant_input(replace(loop, controller=factor * controller), constant)
+        scaled = scale_controller(controller, factor)
+        return exchange_constant_input(replace(loop, controller=scaled), constant)
     return None
 
 

@@ -38,6 +38,7 @@ from .controller_changes import (
     TRIAL,
     list_changes,
     measure_opposite_sign,
+    scale_controller,
     take_limits_off,
 )
 from .residual_tests import compute_explained_share
@@ -114,7 +115,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     part = record[first : first + MOST]
     resolution, sample, seen = 0.0, None, ""
     if law.dt == 0.0:
-        form = find_sampled_form(loop.controller, part)
+        form = find_sampled_form(loop.controller, part, loop.equations().outputs[0])
         if form is not None:
             text = describe_sampled_form(form, part, "the loop")
             return [("sampled", text, form.analog, True)]
@@ -127,8 +128,9 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
         loop, resolution, sample = sampled
     facts: list[Fact] = []
     lower, upper = loop.input_limits
-    slack = 1e-6 * (float(np.ptp(part.u)) + 1e-300)
-    beyond = float(np.mean((part.u < lower - slack) | (part.u > upper + slack)))
+    logged = part.u[part.valid]
+    slack = 1e-6 * (float(np.ptp(logged)) + 1e-300)
+    beyond = float(np.mean((logged < lower - slack) | (logged > upper + slack)))
     if beyond:
         facts.append(("limit", f"u is outside the input limits of the loop ({lower:g} to "
                       f"{upper:g}) for {write_percent(beyond)} of the samples: u was logged before "
@@ -253,7 +255,7 @@ def _sample_analog_law(
     _, _, hold_r, hold, sampled, _ = best
 
     def sample(factor: Any) -> Loop | None:
-        changed = exchange_controller(loop, factor * loop.controller)
+        changed = exchange_controller(loop, scale_controller(loop.controller, factor))
         return sample_analog_controller(changed, hold_r, hold)
 
     return sampled, max(EXACT, resolve(best) / spread), sample

@@ -18,7 +18,7 @@ from ..data.converter_grid import estimate_rounding, find_grid_step
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
 from ..data.validity import find_longest_run, find_runs
-from ..loop.loop import Loop, find_input_limits
+from ..loop.loop import Loop, describe_other_output, find_input_limits
 from ..loop.unit_check import describe_distance, find_unit_clashes, measure_distance
 from ..loop.wiring import match_signals
 from . import signal_defects as defects
@@ -571,7 +571,7 @@ class _RecordChecks:
         return max(self.record.segments(), key=lambda ends: ends[1] - ends[0])
 
     def check_operating_point(self, loop: Loop) -> list[AuditFinding]:
-        other = loop.describe_other_output()
+        other = describe_other_output(loop)
         if other:
             text = (
                 f"the output of the loop's operating point is {loop.point.output:.4g}, but "

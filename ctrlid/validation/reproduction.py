@@ -47,7 +47,7 @@ REJECTED = "the law of the controller is rejected, since it is not what computed
 
 def find_law_rejection(loop: Loop, record: Record) -> str:
     """Return why the stated law is not what computed the logged input; empty where it stands."""
-    reject = find_rejection if loop.equations().siso else find_wired_rejection
+    reject = find_rejection if loop.wiring is None else find_wired_rejection
     return reject(loop, record)
 
 
@@ -61,7 +61,7 @@ def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
         return OPEN_LOOP if comes_to_rest(loop) else choose_prediction(loop, record, NO_CONTROLLER)
     if not knows_references(loop.wiring, record):
         return choose_prediction(loop, record, NO_REFERENCE)
-    if not find_long_stretches(record, loop):
+    if record.valid.ndim == 2 and not find_long_stretches(record, loop):
         return choose_prediction(loop, record, MISSING)
     if find_law_rejection(loop, record):
         return choose_prediction(loop, record, REJECTED)

@@ -209,9 +209,15 @@ def average_input(record: Record, factor: int) -> Record:
         raise CtrlidError(f"at {factor} times the period fewer than 2 of the {record.n} samples "
                           "are left; use a shorter period")  # fmt: skip
     cut = n * factor
+    # Between samples u is held, or runs straight to the next one.
+    mean = (
+        record.u
+        if record.hold == "zoh"
+        else 0.5 * (record.u + np.append(record.u[1:], record.u[-1]))
+    )
     return Record(
         r=None if record.r is None else record.r[:cut:factor],
-        u=record.u[:cut].reshape(n, factor).mean(axis=1), y=record.y[:cut:factor],
+        u=mean[:cut].reshape(n, factor).mean(axis=1), y=record.y[:cut:factor],
         dt=record.dt * factor, valid=record.valid[:cut].reshape(n, factor).all(axis=1),
         names=record.names, name=record.name, start=record.start,
         units=record.units, extra={k: v[:cut:factor] for k, v in record.extra.items()},

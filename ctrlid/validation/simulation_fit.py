@@ -209,9 +209,12 @@ def _explain(loop: Loop, record: Record) -> str:
             "it has no reference, which a loop with a controller is simulated from. Give the "
             "record r=, a constant for a fixed set-point."
         )
+    rejected = find_law_rejection(loop, record)
+    if not rejected:
+        return f"{choose_reproduction(loop, record).reason}."
     return (
-        f"the law of the controller is rejected: {find_law_rejection(loop, record)} With another "
-        "law the measured output would come into the simulation."
+        f"the law of the controller is rejected: {rejected} With another law the measured "
+        "output would come into the simulation."
     )
 
 

@@ -226,7 +226,7 @@ def _note_errors(records: Sequence[Record], estimate: Estimate) -> tuple[str, ..
         left -= len(part)
         if left <= 0:
             break
-    coloured = note_coloured_innovations(stretches, len(estimate.names), _BIASED, size)
+    coloured = note_coloured_innovations(stretches, estimate.structure.na, _BIASED, size)
     if coloured or not driven or are_rounding(stretches, size):
         return coloured
     p = compute_independence_probability(*zip(*driven, strict=True))

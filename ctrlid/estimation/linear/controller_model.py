@@ -17,6 +17,7 @@ from ..._base.errors import CtrlidError
 from ..._base.periods import have_same_period, write_both_periods
 from ..._base.statistics import regress
 from ..._base.text import write_count
+from ...loop.controllers import find_input_order
 from ...physics.conversions import require_finite_coefficients, to_polynomials
 from ..identified_model import Structure
 from .instruments import Piece, Signals
@@ -39,7 +40,9 @@ class LinearController:
     source: str
 
 
-def convert_controller(controller: Any, names: Sequence[str], dt: float) -> LinearController:
+def convert_controller(
+    controller: Any, names: Sequence[str], dt: float, output: str = "y"
+) -> LinearController:
     """Turn a controller of r - y or of (r, y) into a law; further signals are added to u.
 
     Parameters
@@ -50,10 +53,12 @@ def convert_controller(controller: Any, names: Sequence[str], dt: float) -> Line
         External signals.
     dt : float
         Sampling period of the record [s].
+    output : str, optional
+        What the record calls its output.
 
     Returns
     -------
-    Law
+    LinearController
         The law.
 
     Raises
@@ -86,8 +91,8 @@ def convert_controller(controller: Any, names: Sequence[str], dt: float) -> Line
         both = write_both_periods("The controller runs", controller.dt, "the record", dt)
         raise CtrlidError(f"{both}. Convert it to the period of the record.")
     numerators, den = _expand_fractions(controller)
-    if controller.ninputs == 2 and list(controller.input_labels) == ["y", "r"]:
-        numerators = numerators[::-1]
+    if controller.ninputs == 2:
+        numerators = [numerators[k] for k in find_input_order(controller, output)]
     feedback = numerators[1] if len(numerators) == 2 else -numerators[0]
     external = tuple(numerators[0] if name == "r" else den for name in names)
     return LinearController(den, external, feedback, "a simulation with the given controller")

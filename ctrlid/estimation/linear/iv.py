@@ -209,7 +209,7 @@ def _fit_row(
     task = Task.prepare(records, structure, names, intercept)
     law = None
     if controller is not None:
-        law = convert_controller(controller, names, records[0].dt)
+        law = convert_controller(controller, names, records[0].dt, *records[0].signals["y"][:1])
     elif alone and all(len(piece.w) == len(names) for piece in task.pieces):
         law = identify_controller(task.pieces, names)
     try:

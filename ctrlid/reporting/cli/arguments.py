@@ -142,6 +142,11 @@ def import_object(option: str, text: str) -> Any:
     if not colon or not module or not name:
         known = f"one of {', '.join(PLANTS)}, " if option == "--model" else ""
         raise CtrlidError(f"{option} is {known}MODULE:NAME or FILE.py:NAME; given {text}")
+    if module.endswith(".py") and not Path(module).is_file():
+        raise CtrlidError(
+            f"{option} {text}: {module} cannot be imported: there is no such file. Give a file, as "
+            "in plant.py:ball, or a module that Python finds from here"
+        )
     try:
         found = _run_file(Path(module)) if module.endswith(".py") else _import_module(module)
     except ModuleNotFoundError as reason:
@@ -151,8 +156,6 @@ def import_object(option: str, text: str) -> Any:
         raise CtrlidError(
             f"{option} {text}: {module} cannot be imported: {reason}. {cure}"
         ) from reason
-    except CtrlidError as reason:
-        raise CtrlidError(f"{option} {text}: {reason}") from reason
     except Exception as reason:
         raise CtrlidError(f"{option} {text}: {_explain_run(module, reason)}") from reason
     if not hasattr(found, name):
@@ -168,9 +171,6 @@ def _run_file(path: Path) -> Any:
     Dataclasses look for their module while it runs. Afterwards it is not among the modules, so that
     its functions go to other processes by value.
     """
-    if not path.is_file():
-        raise CtrlidError(f"{path} cannot be imported: there is no such file. Give a file, as in "
-                          "plant.py:ball, or a module that Python finds from here")  # fmt: skip
     spec = importlib.util.spec_from_file_location(f"ctrlid_model_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
