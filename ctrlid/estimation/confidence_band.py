@@ -74,10 +74,11 @@ def response_band(model: IdentifiedModel, omega: Any, level: float = 0.95) -> Re
         \operatorname{var} \arg G = \Im g^T \Sigma \, \Im g
 
     with the covariance :math:`\Sigma` of the coefficients, which is zero in directions that
-    constraints fix. The limits are symmetric in the logarithm of the magnitude (in dB) and in the
-    phase. This is the first order in the errors: where the band is wide, beyond a factor of two or
-    so, it says that little is known, and not exactly how little. It counts scatter, not bias: the
-    band of `fit_arx` under feedback may miss the truth everywhere.
+    constraints fix, and of a fitted delay, whose slope is :math:`-j\omega`. The limits are
+    symmetric in the logarithm of the magnitude (in dB) and in the phase. This is the first order in
+    the errors: where the band is wide, beyond a factor of two or so, it says that little is known,
+    and not exactly how little. It counts scatter, not bias: the band of `fit_arx` under feedback
+    may miss the truth everywhere.
 
     Parameters
     ----------
@@ -138,9 +139,15 @@ def response_band(model: IdentifiedModel, omega: Any, level: float = 0.95) -> Re
     for i, e in enumerate(np.eye(p)):
         num1, den1 = structure.fraction(e)
         slopes[i] = np.polyval(num1 - num0, at) / num - np.polyval(den1 - den0, at) / den
+    covariance = np.asarray(estimate.covariance)
+    if estimate.delay_covariance.size:
+        # A fitted delay turns the phase by -w for each second.
+        slopes = np.vstack([slopes, -1j * w])
+        beside = np.append(estimate.delay_covariance, estimate.delay_error**2)
+        covariance = np.column_stack([np.vstack([covariance, beside[:-1]]), beside])
     half = float(student_t.ppf(0.5 + level / 2, estimate.degrees_of_freedom))
     errors = [
-        half * np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", part, estimate.covariance, part), 0.0))
+        half * np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", part, covariance, part), 0.0))
         for part in (slopes.real, slopes.imag)
     ]
     response = num / den * np.exp(-1j * w * model.delay)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import control
@@ -175,6 +175,8 @@ class Estimate(_text.Printed):
         What the residuals are: those of the ARX equation, or of the output's prediction.
     delay, delay_error : float
         Delay of the input [s] and its standard error, zero for one that was not fitted.
+    delay_covariance : (p,) array
+        Covariance of a fitted delay with each coefficient; empty for one that was not.
     """
 
     structure: Structure
@@ -195,12 +197,13 @@ class Estimate(_text.Printed):
     errors: Literal["equation error", "prediction error"] = "prediction error"
     delay: float = 0.0
     delay_error: float = 0.0
+    delay_covariance: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        for field in ("values", "covariance", "intercepts"):
-            array = np.array(getattr(self, field), dtype=float)
+        for name in ("values", "covariance", "intercepts", "delay_covariance"):
+            array = np.array(getattr(self, name), dtype=float)
             array.setflags(write=False)
-            object.__setattr__(self, field, array)
+            object.__setattr__(self, name, array)
 
     @property
     def names(self) -> tuple[str, ...]:

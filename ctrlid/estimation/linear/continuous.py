@@ -183,10 +183,10 @@ def fit_continuous(
     point, found, rss = best.point, best.found, best.rss
     degrees = best.used - best.fitted
     notes = (*note_sampled_controller(controller, records, "fit_continuous"), *notes)
-    late, delay_error = "", 0.0
+    late, delay_variance, delay_covariance = "", 0.0, np.zeros(0)
     if task.free_delay:
         late = ", with the delay"
-        delay_error = math.sqrt(measure_delay_spread(best) * rss / degrees)
+        delay_variance, delay_covariance = measure_delay_spread(best)
     if best.task.colour:
         late += f", sensor noise a moving average of order {best.task.colour}"
     estimate = Estimate(
@@ -195,7 +195,8 @@ def fit_continuous(
         degrees_of_freedom=degrees, active_bounds=found.active_bounds, branch=found.branch,
         method=("constrained " if known else "") + "prediction error (continuous time)",
         solver=f"Gauss-Newton steps, {found.solver}{late}", dt=0.0, condition=found.condition,
-        notes=notes, delay=point.delay, delay_error=delay_error,
+        notes=notes, delay=point.delay, delay_error=math.sqrt(delay_variance * rss / degrees),
+        delay_covariance=delay_covariance * rss / degrees,
     )  # fmt: skip
     _check_speed(estimate.poles, records[0].dt)
     names = records[0].names

@@ -238,12 +238,12 @@ def _differentiate_by_coefficients(task: Task, point: Point, piece: Piece, here:
     return np.column_stack(slopes)
 
 
-def measure_delay_spread(best: Minimum) -> float:
-    r"""Return the variance of a delay that was fitted, in units of the residual variance.
+def measure_delay_spread(best: Minimum) -> tuple[float, Array]:
+    r"""Return variance and covariances of a fitted delay, in units of the residual variance.
 
     .. math:: R_1 (\eta - \hat\eta) + R_{12} (\theta - \hat\theta) = w, \quad
         \operatorname{cov} \hat\eta = R_1^{-1} R_1^{-\mathsf T} + W S W^{\mathsf T}, \quad
-        W = R_1^{-1} R_{12}
+        \operatorname{cov}(\hat\eta, \hat\theta) = -W S, \quad W = R_1^{-1} R_{12}
 
     for the observer gains and the delay :math:`\eta`, with the rows R of the triangular factor and
     the spread S of the coefficients. At a delay of zero the slope is that towards larger ones.
@@ -255,7 +255,7 @@ def measure_delay_spread(best: Minimum) -> float:
     inverse = np.linalg.pinv(factor[:extra, :extra])
     rows = inverse @ factor[:extra, extra:p]
     spread = inverse @ inverse.T + rows @ best.found.spread @ rows.T
-    return float(spread[-1, -1])
+    return float(spread[-1, -1]), -rows[-1] @ best.found.spread
 
 
 def _measure_coefficients(task: Task, point: Point) -> Array:
