@@ -145,7 +145,10 @@ def test_nothing_is_missing_behind_an_encoder():
 
 @pytest.mark.parametrize(
     ("hidden", "name", "size"),
-    [({"friction": 0.04}, "CoulombFriction", 0.04 / J), ({"lag": 0.012}, "ActuatorLag", 0.012)],
+    [
+        pytest.param({"friction": 0.04}, "CoulombFriction", 0.04 / J, marks=pytest.mark.slow),
+        ({"lag": 0.012}, "ActuatorLag", 0.012),
+    ],
 )
 def test_an_effect_is_named_behind_an_encoder(hidden, name, size):
     effects = cid.effects

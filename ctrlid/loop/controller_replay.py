@@ -145,7 +145,8 @@ def replay_controller(loop: Loop, record: Record) -> Array:
     The controller's initial state is not in the record; it is chosen to reproduce the logged u
     best. What then remains between the result and ``record.u`` is not the controller's: injected
     pulses or dither, a channel logged late, another controller. An observer reads the logged u.
-    Where a reading does not count, the last one that does stands for it.
+    Where readings do not count, the controller had them all the same, or the last ones that do:
+    whichever reproduces the logged u better.
 
     Parameters
     ----------
@@ -238,7 +239,14 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     if not knows_references(loop.wiring, record):
         raise ModelCannotRun("the record has no reference r, which the controller needs; give it "
                               "r=, a constant for a fixed set-point")  # fmt: skip
-    record = _hold_readings(record)
+    # A reading that does not count may be what the controller had, or be none at all.
+    tried = [_replay(loop, one) for one in dict.fromkeys((record, _hold_readings(record)))]
+    replayed, start, _ = min(tried, key=lambda one: one[2])
+    return replayed, start
+
+
+def _replay(loop: Loop, record: Record) -> tuple[Array, Array, float]:
+    """Return input and initial state of a controller that had these readings, and the misfit."""
     r = read_references(loop, record)
     run = _build_controller_run(loop, record.y, r, record.u)
     start = run.rest
@@ -261,7 +269,7 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
         if not cost < best:
             break
         start, replayed, best = moved, trial, cost
-    return replayed, start
+    return replayed, start, best
 
 
 def differentiate_replay(loop: Loop, record: Record) -> tuple[Array, Array, float]:
