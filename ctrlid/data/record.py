@@ -20,7 +20,7 @@ from . import csv_files as _csv
 from . import responses as _response
 from .csv_files import SIGNALS as SIGNALS
 from .field_checks import check_samples, check_seconds, check_words
-from .validity import find_runs, find_whole_past
+from .validity import find_last_valid, find_runs, find_whole_past
 
 Hold = Literal["zoh", "foh", "bandlimited"]
 # Columns of a CSV file have these names, so that no extra channel may.
@@ -723,3 +723,13 @@ def fill_readings(record: Record) -> Record:
     rows = zip(np.reshape(record.y, (-1, len(record))), record.valid_outputs, strict=True)
     y = [np.interp(k, k[use], row[use]) if use.any() else row for row, use in rows]
     return replace(record, y=np.reshape(y, np.shape(record.y)))
+
+
+def hold_readings(record: Record) -> Record:
+    """Return a record in which each output keeps its last value where it does not count."""
+    each = np.reshape(record.valid_outputs, (-1, len(record)))
+    if each.all() or not each.any(axis=1).all():
+        return record
+    rows = zip(np.reshape(record.y, (-1, len(record))), each, strict=True)
+    y = np.array([row[find_last_valid(use)] for row, use in rows])
+    return replace(record, y=y.reshape(np.shape(record.y)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
-from ..data.record import Record
+from ..data.record import Record, hold_readings
 from ..data.validity import find_last_valid
 from ..effects import AbstractEffect
 from ..effects.base import name_at_place
@@ -192,14 +192,10 @@ def list_candidates(
 
 def _hold_last_valid(record: Record) -> Record:
     """Return a record in which what does not count repeats the last value that does."""
-    n, seen = len(record), np.asarray(record.valid_somewhere)
-    each = np.reshape(record.valid_outputs, (-1, n))
-    if each.all():
+    if record.valid.all():
         return record
-    u = np.asarray(record.u)[..., find_last_valid(seen)]
-    rows = zip(np.reshape(record.y, (-1, n)), each, strict=True)
-    y = np.array([row[find_last_valid(use)] for row, use in rows])
-    return replace(record, u=u, y=y.reshape(np.shape(record.y)))
+    u = np.asarray(record.u)[..., find_last_valid(record.valid_somewhere)]
+    return replace(hold_readings(record), u=u)
 
 
 def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:

@@ -1,7 +1,7 @@
 """The input that a loop's controller computes from recorded signals."""
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
@@ -14,13 +14,11 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.periods import have_same_period, write_both_periods, write_difference
 from .._base.rounding import keep_numpy_quiet
-from ..data.record import Record
+from ..data.record import Record, hold_readings
 from ..data.several_records import order_model_and_data
-from ..data.validity import find_last_valid
 from ..physics.block_evaluation import BlockEvaluation
-from ..physics.conversions import to_state_matrices
-from .controllers import find_input_order
 from .loop import Loop, exchange_controller, exchange_limits
+from .sampled_form import read_matrices
 from .wiring import knows_references, match_signals, stack_references
 
 
@@ -211,12 +209,7 @@ def sample_analog_controller(loop: Loop, hold_r: str, hold_y: str) -> Loop | Non
         law = ct.tf([float(law)], [1.0])
     if not isinstance(law, ct.TransferFunction | ct.StateSpace):
         return None
-    a, b, c, d = to_state_matrices(law)
-    if law.ninputs == 1:
-        b, d = np.hstack([b, -b]), np.hstack([d, -d])
-    else:
-        order = list(find_input_order(law, loop.equations().outputs[0]))
-        b, d = b[:, order], d[:, order]
+    a, b, c, d = read_matrices(law, loop.equations().outputs[0])
     n, dt = len(a), loop.dt
     # The input is a signal and its slope over the period.
     block = np.zeros((n + 4, n + 4))
@@ -240,7 +233,7 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
         raise ModelCannotRun("the record has no reference r, which the controller needs; give it "
                               "r=, a constant for a fixed set-point")  # fmt: skip
     # A reading that does not count may be what the controller had, or be none at all.
-    tried = [_replay(loop, one) for one in dict.fromkeys((record, _hold_readings(record)))]
+    tried = [_replay(loop, one) for one in dict.fromkeys((record, hold_readings(record)))]
     replayed, start, _ = min(tried, key=lambda one: one[2])
     return replayed, start
 
@@ -285,19 +278,6 @@ def _compare_inputs(run: _ControllerRun, start: Array, record: Record) -> tuple[
     replayed = run.compute_outputs(start)
     left = np.where(record.valid_somewhere, replayed - record.u, 0.0)
     return replayed, float(np.sum(left**2))
-
-
-def _hold_readings(record: Record) -> Record:
-    """Return a record in which each output keeps its last value where it does not count.
-
-    What a controller remembers is not led astray by a reading that was none.
-    """
-    each = np.reshape(record.valid_outputs, (-1, len(record)))
-    if each.all() or not each.any(axis=1).all():
-        return record
-    rows = zip(np.reshape(record.y, (-1, len(record))), each, strict=True)
-    y = np.array([row[find_last_valid(use)] for row, use in rows])
-    return replace(record, y=y.reshape(np.shape(record.y)))
 
 
 def _take_gauss_newton_step(run: _ControllerRun, start: Array, u: Array, use: Any) -> Array:

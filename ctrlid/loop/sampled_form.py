@@ -152,7 +152,7 @@ def note_sampled_controller(
     return ()
 
 
-def _read_matrices(controller: Any, *outputs: str) -> tuple[Array, Array, Array, Array]:
+def read_matrices(controller: Any, *outputs: str) -> tuple[Array, Array, Array, Array]:
     """Return the state matrices of a controller as one with the inputs r and y.
 
     Besides y the measurement may have the names of outputs.
@@ -171,7 +171,7 @@ def _discretize(matrices: Any, dt: float, method: Any) -> Any:
 
 def _list_sampled(controller: Any, dt: float, *outputs: str) -> Iterator[tuple[str, Any]]:
     """Yield the rules of sampling and the state matrices that they make."""
-    matrices = _read_matrices(controller, *outputs)
+    matrices = read_matrices(controller, *outputs)
     for rule, method in RULES.items():
         try:
             yield rule, _discretize(matrices, dt, method)
@@ -182,12 +182,12 @@ def _list_sampled(controller: Any, dt: float, *outputs: str) -> Iterator[tuple[s
         # The rule matches the gain at rest, which an integral or a zero there does not have.
         if np.isfinite(gain) and gain != 0:
             matched = ct.sample_system(ct.tf(controller), dt, "matched")
-            yield "matched", _read_matrices(matched)
+            yield "matched", read_matrices(matched)
 
 
 def _run_analog(controller: Any, record: Record, *outputs: str) -> Iterator[Array]:
     """Yield what the analog law makes of a straight y, and of an r that is held or straight."""
-    matrices = _read_matrices(controller, *outputs)
+    matrices = read_matrices(controller, *outputs)
     if not matrices[0].size:
         yield _run(matrices, record)
         return
