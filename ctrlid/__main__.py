@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
@@ -35,6 +35,9 @@ from .reporting.plot.axes import off_screen
 from .reporting.tables import Table
 
 FOLDER = "ctrlid-report"
+# What the story is told with where no option says otherwise.
+STORY: dict[str, Any] = {"output": None, "seed": 1, "samples": 45_000, "noise": 0.1}
+NEGATIVE = re.compile(r"-\.?\d")
 # The story can be told with at least so many samples.
 FEWEST = 500
 # Paragraphs are wrapped at so many characters.
@@ -68,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words and (advice := _name_python_line(*words[:2])):
         parser.error(advice)
-    args, unknown = parser.parse_known_args(arguments)
+    args, unknown = parser.parse_known_args(_join_negatives(words))
     if unknown:
         advice = ""
         if all("=" in word and not word.startswith("-") for word in unknown):
@@ -77,6 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "them or in quotes: --columns r=ref,u=volt,y=gap"
             )
         parser.error(f"unrecognized arguments: {' '.join(unknown)}{advice}")
+    foreign = [k for k in STORY if getattr(args, k) is not None and args.run is not _tell_stories]
+    if foreign:
+        parser.error(f"--{foreign[0]} belongs to the demonstration, and no command takes it; "
+                     "ctrlid diagnose writes its files into the folder of --save")  # fmt: skip
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
@@ -93,6 +100,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return code
+
+
+def _join_negatives(words: list[str]) -> list[str]:
+    """Return the words with negative numbers joined to their options.
+
+    By itself, -5e-4 is an option for argparse.
+    """
+    joined: list[str] = []
+    for word in words:
+        option = joined[-1] if joined else ""
+        if NEGATIVE.match(word) and option.startswith("--") and "=" not in option:
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def _name_python_line(word: str, file: str = "log.csv") -> str:
@@ -154,14 +176,17 @@ def _make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--seed",
         type=_parse_natural,
-        default=1,
-        help="seed of the reference, the noise and the hidden effect (default: %(default)s)",
+        help=f"seed of the reference, the noise and the hidden effect (default: {STORY['seed']})",
     )
-    parser.add_argument("--samples", type=_parse_samples, default=45_000, metavar="N",
-                        help="samples of the experiment (default: %(default)s)")  # fmt: skip
-    parser.add_argument("--noise", type=_parse_share, default=0.1, metavar="SHARE",
+    parser.add_argument(
+        "--samples",
+        type=_parse_samples,
+        metavar="N",
+        help=f"samples of the experiment (default: {STORY['samples']})",
+    )
+    parser.add_argument("--noise", type=_parse_share, metavar="SHARE",
                         help="standard deviation of the sensor noise, as a share of the jump "
-                        "of the reference (default: %(default)s)")  # fmt: skip
+                        f"of the reference (default: {STORY['noise']})")  # fmt: skip
     parser.add_argument("--output", type=Path, metavar="DIR",
                         help=f"folder for figures and report (default: {FOLDER}, with a number "
                         "if it exists)")  # fmt: skip
@@ -194,10 +219,13 @@ def _parse_share(text: str) -> float:
 
 
 def _tell_stories(args: argparse.Namespace) -> int:
-    folder = make_folder(args.output, "--output", FOLDER)
+    given = {k: v for k in STORY if (v := getattr(args, k)) is not None}
+    wanted = STORY | given
+    folder = make_folder(wanted.pop("output"), "--output", FOLDER)
     sections = []
-    first = tell_identification(samples=args.samples, noise=args.noise, seed=args.seed)
-    chapters = itertools.chain(first, tell_diagnosis(samples=args.samples, seed=args.seed))
+    first = tell_identification(**wanted)
+    second = tell_diagnosis(samples=wanted["samples"], seed=wanted["seed"])
+    chapters = itertools.chain(first, second)
     titles = (*TITLES, *SECOND)
     try:
         # With disable=None the bar is silent where stderr is no terminal.

@@ -104,10 +104,10 @@ def test_few_samples_that_do_not_count_are_not_rounded_away():
 
 def test_text():
     assert str(full(8)) == repr(full(8)) == "\n".join([
-        "Record run 3, second try: 8 samples at 0.1 s (0.8 s, foh), 87.5 % valid",
+        "Record run 3, second try: 8 samples at 0.1 s (0.8 s, foh), 87.5 % valid; ranges of these:",
         "  r         -1 .. 1 m",
         "  u (duty)  -0.958924 .. 0.909297",
-        "  y (gap)   -0.989992 .. 1 m",
+        "  y (gap)   -0.653644 .. 1 m",
         "  current   0 .. 2.33333 A",
         "  x[0]      -1 .. 0",
     ])  # fmt: skip

@@ -9,6 +9,7 @@ import os
 import re
 import sys
 import warnings
+from pathlib import Path
 
 import control as ct
 import numpy as np
@@ -432,6 +433,8 @@ def test_a_failed_diagnosis_leaves_no_folder(folder, capsys, monkeypatch):
     )
     assert not (folder / "new").exists()
     (folder / "old").mkdir()
+    refused(capsys, "log.csv", *COLUMNS, *SERVO, "--save", "old")
+    assert (folder / "old").is_dir()
     (folder / "old" / "mine").write_text("mine")
     words = refused(capsys, "log.csv", *COLUMNS, *SERVO, "--save", "old")
     assert "old is not empty and nothing is overwritten; give --save a new folder" in words
@@ -495,3 +498,64 @@ def test_columns_may_be_given_one_by_one():
     given = parser.parse_args(["--columns", "u=volt", "--columns", "y=pos"])
     assert given.columns == {"u": "volt", "y": "pos"}
     assert parser.parse_args([]).columns == {}
+
+
+def test_a_report_that_cannot_be_saved_is_printed(folder, asked, capsys, monkeypatch):
+    """A full disk cost the answer of minutes."""
+
+    def fail(found, name):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(_command.plot, "diagnosis", fail)
+    monkeypatch.setattr(_command.Diagnosis, "save", fail)
+    found = cid.load_diagnosis(Path(__file__).with_name("saved_diagnosis.json"))
+    monkeypatch.setattr(_command, "diagnose", lambda *a, **k: found)
+    assert run("log.csv", *COLUMNS, *SERVO, "--save", "new") == 1
+    out, err = capsys.readouterr()
+    assert out.startswith("Diagnosis of maglev")
+    assert "not all of the answer is saved in new" in err
+    assert "No space left" in err
+
+
+def test_options_before_the_command_count_or_are_refused(folder, asked, capsys):
+    assert command.main(["--quiet", "diagnose", "log.csv", *COLUMNS, *SERVO]) == 0
+    assert asked[-1][2]["progress"] is False
+    with pytest.raises(SystemExit) as ended:
+        command.main(["--output", "here", "diagnose", "log.csv", *COLUMNS, *SERVO])
+    assert ended.value.code == 2
+    assert "--output belongs to the demonstration" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "bias"), [(("--input-bias", "-1e-3"), -1e-3), (("--input-bias=-.5",), -0.5)]
+)
+def test_negative_numbers_are_numbers(folder, asked, given, bias):
+    assert run("log.csv", *COLUMNS, *SERVO, *given) == 0
+    assert asked[-1][0].at.input == bias
+
+
+CART = """
+import ctrlid as cid
+cart = cid.plants.cart_pole(M=0.5, m=0.1, length=0.3, c=0.1)
+linear = cid.linearize(cart, cid.operating_point(cart, output=(0, 0)))
+"""
+
+
+def test_a_model_of_several_outputs_is_told_where_it_rests(folder, asked, capsys):
+    """Each model of two outputs that was no Loop ended in an IndexError."""
+    rng = np.random.default_rng(0)
+    rows = np.column_stack([0.01 * np.arange(400), *rng.standard_normal((3, 400))])
+    np.savetxt("two.csv", rows, delimiter=",", comments="", header="time [s],F,x,theta")
+    (folder / "plant.py").write_text(CART)
+    given = ("two.csv", "--columns", "y=x,theta u=F", "--model")
+    words = refused(capsys, *given, "plant.py:cart")
+    assert "the model has 2 outputs (x, theta)" in words
+    assert "give --at-output with a value for each, as in --at-output 0,0" in words
+    assert run(*given, "plant.py:cart", "--at-output", "-0.1,0") == 0
+    assert asked[-1][0].at.output == (-0.1, 0.0)
+    assert run(*given, "plant.py:linear") == 0
+    assert asked[-1][0].at.output == pytest.approx((rows[:, 2].mean(), rows[:, 3].mean()))
+    capsys.readouterr()
+    words = refused(capsys, *given, "plant.py:cart", "--at-output", "0.1")
+    assert "--at-output takes a number for each of x, theta" in words
+    assert "given 1" in words

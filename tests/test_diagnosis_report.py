@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import control as ct
@@ -21,10 +22,12 @@ from ctrlid.diagnosis.noise_tests import NoiseTests, choose_alarm_level
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.result import Diagnosis
 from ctrlid.diagnosis.saving import SavedLoop
+from ctrlid.diagnosis.several_records import merge_diagnoses
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.verdict import describe_grounds, gap_stands_out
 from ctrlid.diagnosis.where import locate_errors
 from ctrlid.reporting import pictures as _pictures
+from ctrlid.reporting.tables import make_blocks
 from ctrlid.validation.record_simulation import prepare_stretch
 from ctrlid.validation.reproduction import CLOSED_LOOP
 from problems import drive, legend, levitation, record_of, servo
@@ -538,8 +541,9 @@ def test_an_effect_is_drawn_as_found_in_the_round_that_took_it(found):
     ranking = tuple(replace(bar, round=k, gain=g) for k, g in ((1, 900.0), (2, 400.0), (3, 2.0)))
     rounds = _pictures.make_ranking(replace(base, ranking=ranking))
     assert {k: bars[0].kind for k, bars in rounds.items()} == {
-        1: "fitted, not taken", 2: "found", 3: "fitted, not taken"}  # fmt: skip
-    assert rounds[2][0].evidence == base.findings[0].evidence
+        "round 1": "fitted, not taken", "round 2": "found", "round 3": "fitted, not taken"
+    }  # fmt: skip
+    assert rounds["round 2"][0].evidence == base.findings[0].evidence
     shown = [t.get_text() for t in plot.diagnosis(replace(base, ranking=ranking))[4].texts]
     assert any(t.endswith(f"; evidence {base.findings[0].evidence:.0f}") for t in shown)
 
@@ -585,7 +589,7 @@ def test_two_drifts_are_told_apart_by_their_parameters(found, tmp_path):
     rows = tuple(Candidate(1, e, 90.0, g, 5.0) for e, g in zip(drifts, (90.0, 80.0), strict=True))
     both = replace(base, findings=(two,), ranking=rows,
                    sensitivity={"ParameterDrift of m.rate": 0.1})  # fmt: skip
-    assert [(bar.label, bar.kind) for bar in _pictures.make_ranking(both)[1]] == [
+    assert [(bar.label, bar.kind) for bar in _pictures.make_ranking(both)["round 1"]] == [
         ("ParameterDrift of K", "fitted, not taken"), ("ParameterDrift of m", "found")]  # fmt: skip
     assert legend(plot.diagnosis(both)[0])[-1].endswith("with ParameterDrift of m")
     assert "1. ParameterDrift of m: a parameter of the plant drifts" in text(both)
@@ -599,7 +603,7 @@ def test_two_drifts_are_told_apart_by_their_parameters(found, tmp_path):
 def test_a_name_that_does_not_stand_is_no_find_in_the_picture(found):
     base = found["explained"]
     doubted = replace(base, findings=(), stand_ins=base.findings)
-    kinds = {bar.kind for bar in _pictures.make_ranking(doubted)[1]}
+    kinds = {bar.kind for bar in _pictures.make_ranking(doubted)["round 1"]}
     assert "in the model, but its name does not stand" in kinds
     assert "found" not in kinds
 
@@ -882,3 +886,124 @@ def test_the_rest_of_a_small_catalogue_is_counted_in_words(rivals, words):
     found = SimpleNamespace(added=(finding,), verdict="explained", finished=True,
                             ranking=[SimpleNamespace(effect=e) for e in tried])  # fmt: skip
     assert words in wording.describe_certainty(found, finding)
+
+
+# --- what readers of the reports found
+
+
+def test_each_record_has_rounds_of_its_own(found):
+    """Friction of records 1 and 2 was "taken, later replaced or dropped" in one of them."""
+    base = found["explained"]
+    rows = (*(replace(c, record=1) for c in base.ranking), replace(base.ranking[0], record=2),
+            replace(base.ranking[0], record=3))  # fmt: skip
+    seen = replace(base.findings[0], records=(1, 2))
+    several = replace(base, findings=(seen,), ranking=rows)
+    rounds = _pictures.make_ranking(several)
+    assert [*rounds] == ["record 1, round 1", "record 1, round 2", "record 2, round 1",
+                         "record 3, round 1"]  # fmt: skip
+    kinds = [next(b.kind for b in bars if b.label == "CoulombFriction")
+             for name, bars in rounds.items() if name.endswith("round 1")]  # fmt: skip
+    assert kinds == ["found", "found", "fitted, not taken"]
+    tried_in = [row[1] for row in make_blocks(several)[-1].rows]
+    assert tried_in[0] == "record 1, round 1"
+
+
+def test_errors_of_two_kinds_have_no_mean(found):
+    """The gap of a simulation and that of a prediction went into one figure."""
+    base = found["explained"]
+    far = replace(base.gap, kind="prediction", horizon=37, samples=20, given=1.0, before=1.0,
+                  after=0.5, floor=0.4, recalibrated=1.0, closed_loop=False)  # fmt: skip
+    other = replace(base, gap=far, notes=("the law was rejected",),
+                    findings=(replace(base.findings[0], evidence=1.0),))  # fmt: skip
+    merged = merge_diagnoses(levitation(dt=DT), [base, other])
+    assert merged.gap.name == "closed-loop simulation"
+    assert merged.gap.given == pytest.approx(base.gap.given)
+    said = " ".join(merged.notes)
+    assert "The gap is that of record 1, on the last quarter" in said
+    assert "that of record 2 is the RMS error of the 37-step prediction, 1 m before, 0.5" in said
+    assert "record 2: the law was rejected" in merged.notes
+
+
+def test_a_bound_is_no_standard_error_of_zero(found):
+    held = replace(found["explained"].calibrated[0], standard_error=0.0)
+    table = next(b for b in make_blocks(replace(found["explained"], calibrated=(held,)))
+                 if getattr(b, "caption", "").startswith("The free parameters"))  # fmt: skip
+    assert table.rows[0][-1] == "on its bound"
+
+
+def test_effects_on_two_states_keep_their_units_in_a_file(tmp_path):
+    def drain(t, x, u, p):
+        return [u[0] - p["a"] * x[0], p["a"] * x[0] - x[1]]
+
+    plant = ct.nlsys(drain, lambda t, x, u, p: x[1], inputs=["q"], outputs=["T"],
+                     states=["level", "T"], params={"a": 1.0}, name="tank")  # fmt: skip
+    loop = cid.Loop(plant, None, dt=0.1, units={"level": "m", "T": "K", "q": "m/s", "a": "1/s"})
+    limits = [E.StateLimit("level", upper=0.5, spill_to="T", share=0.3),
+              E.StateLimit("T", upper=300.0, spill_to="level", share=0.2)]  # fmt: skip
+    rows = tuple(Candidate(1, e, 50.0, 50.0, 3.0) for e in limits)
+    wrong = E.ParameterError("a", error=0.2)
+    findings = tuple(Finding(e, {k: 0.01}, (), (), 50.0)
+                     for e, k in ((limits[0], "upper"), (wrong, "error")))  # fmt: skip
+    base = cid.load_diagnosis(Path(__file__).with_name("saved_diagnosis.json"))
+    found = replace(base, loop=loop.with_effect(limits[0]), findings=findings, ranking=rows,
+                    calibrated=())  # fmt: skip
+    again = cid.load_diagnosis(found.save(tmp_path / "found.json"))
+    assert str(again) == str(found)
+    assert "upper = 0.500 ± 0.010 m" in str(again)
+    assert "a = 1.200 ± 0.010 1/s in place of 1 1/s" in " ".join(str(again).split())
+    assert "upper = 300 K" in wording.describe_parameters(again, limits[1])
+
+
+def test_the_bars_of_what_loses_are_cut_and_say_so(found):
+    base = found["explained"]
+    rows = (replace(base.ranking[0], effect=E.CubicStiffness(k3=1.0), score=-2267.0, gain=math.nan),
+            base.ranking[0])  # fmt: skip
+    shown = [t.get_text() for t in plot.diagnosis(replace(base, ranking=rows))[4].texts]
+    assert "below -10" in shown
+    assert "about -10" not in shown
+
+
+def test_a_gap_without_end_is_written_with_an_exponent(found):
+    gap = replace(found["explained"].gap, given=1.234e40)
+    label, size, times = wording.list_gap_rows(gap)[0]
+    assert (label, size) == ("the model as given", "1.23e+46 µm")
+    assert len(times) < 22
+
+
+def test_a_model_without_free_parameters_is_not_recalibrated(found):
+    base = found["explained"]
+    gap = replace(base.gap, given=base.gap.before)
+    plain = replace(base, gap=gap, calibrated=())
+    assert [row[0] for row in wording.list_gap_rows(gap)] == [
+        "the model as given", "with the effects", "noise floor"]  # fmt: skip
+    picture = plot.diagnosis(plain)
+    assert "closed-loop simulation, model as given" in legend(picture[0])
+    assert not any("recalibrated" in t for ax in picture.axes for t in legend(ax))
+
+
+def test_a_prediction_is_not_spoken_of_as_a_simulation(found):
+    base = found["explained"].gap
+    gap = replace(base, kind="prediction", horizon=25, before=base.floor, after=1.001 * base.floor,
+                  recalibrated=math.nan, closed_loop=False)  # fmt: skip
+    said = wording.describe_shrinking(gap)
+    assert said.startswith("By noise alone, the predictions of the completed model err by as much")
+
+
+def test_the_places_of_several_outputs_say_whose_errors_they_are(found):
+    base = found["unknown"]
+    two = tuple(replace(p, axis="theta_dot", output=o)
+                for p, o in zip(base.where[:2], ("x", "theta"), strict=True))  # fmt: skip
+    blocks = make_blocks(replace(base, where=two))
+    table = next(b for b in blocks if getattr(b, "head", ("",))[0] == "in bins of")
+    assert [row[0] for row in table.rows] == [
+        "theta_dot, errors of x",
+        "theta_dot, errors of theta",
+    ]
+    assert table.head == ("in bins of", "RMS", "p-value")
+    assert any(isinstance(b, str) and b.startswith("theta_dot, errors of x: ") for b in blocks)
+
+
+def test_long_names_of_signals_are_wrapped_and_not_refused(found):
+    base = found["unknown"]
+    name = "change of Application.PLC_PRG.Axis1.fbController.fbPosition.rActualVelocity"
+    assert name in str(replace(base, where=(replace(base.where[0], axis=name),)))

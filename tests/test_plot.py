@@ -14,6 +14,7 @@ from ctrlid import plot
 from ctrlid.reporting import pictures as _pictures
 from ctrlid.reporting.plot import findings
 from ctrlid.reporting.plot.axes import COLOURS
+from ctrlid.reporting.tables import make_blocks
 from problems import legend, record_of, redesigned_levitation, servo
 
 DT = 0.01
@@ -344,7 +345,7 @@ def test_poles_of_several_signals_and_a_single_one_at_the_origin():
 def test_poles_in_the_s_plane():
     (ax,) = plot.poles({"a": ct.tf(1, [1, 2, 10]), "b": ct.tf(1, [1, 0])})
     assert labels(ax) == ("real part of s [rad/s]", "imaginary part of s [rad/s]")
-    assert legend(ax) == ["a: -1+3j, -1-3j", "b: 0"]
+    assert legend(ax) == ["a: -1±3j", "b: 0"]
 
 
 @pytest.mark.parametrize("draw", [plot.poles, plot.bode])
@@ -500,3 +501,55 @@ def test_a_picture_is_saved_as_a_figure_is(tmp_path):
     record = cid.Record(u=[0, 1, 0, 1], y=[0, 0, 1, 1], dt=0.1)
     cid.plot.record(record).savefig(tmp_path / "record.png", dpi=40)
     assert (tmp_path / "record.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.fixture
+def dropout(record):
+    """The record with a dropout of the sensor that is marked, and far from all else."""
+    y, valid = np.array(record.y), np.ones(len(record), bool)
+    y[100:110], valid[100:110] = 1e6, False
+    return replace(record, y=y, valid=valid)
+
+
+def test_a_dropout_that_does_not_count_sets_no_scale(dropout, record):
+    """A dropout of 1e6 made flat lines of all others, and the mean of the table 5000."""
+    ax = plot.record(dropout).axes[0]
+    assert ax.get_ylabel() == plot.record(record).axes[0].get_ylabel()
+    low, high = ax.get_ylim()
+    assert high - low < 3 * 1e3 * np.ptp(record.y)
+    assert "1e+06" not in repr(dropout)
+    table = make_blocks(dropout)[0]
+    row = next(row for row in table.rows if row[0] == "x")
+    assert float(row[4]) == pytest.approx(dropout.y[dropout.valid].max(), rel=1e-5)
+    assert "whose numbers are these" in table.caption
+
+
+def test_a_dropout_leaves_a_comparison_readable(dropout):
+    loop = servo(5.0, dt=dropout.dt)
+    ax = plot.comparison(cid.compare(dropout, loop), window=(dropout.start, dropout.t[-1])).axes[0]
+    low, high = ax.get_ylim()
+    assert high - low < 20 * 1e3 * np.ptp(dropout.y[dropout.valid])
+
+
+def test_a_reference_in_another_unit_has_axes_of_its_own(record):
+    volts = replace(record, r=10 * np.sign(record.r), units={**record.units, "r": "V", "y": "m"})
+    labels = [ax.get_ylabel() for ax in plot.record(volts).axes]
+    assert len(labels) == 3
+    assert labels[1] == "r [V]"
+
+
+def test_many_poles_stay_in_the_figure():
+    """The legend of twenty poles ran off the page and left the axes no room."""
+    rng = np.random.default_rng(0)
+    roots = 0.9 * np.exp(1j * rng.uniform(0.1, 3, 10))
+    models = {"order 20": ct.tf(1, np.real(np.poly(np.r_[roots, roots.conj()])), 0.1),
+              "order 3": ct.tf(1, np.poly([0.5, 0.2, -0.3]), 0.1)}  # fmt: skip
+    picture = plot.poles(models)
+    picture.figure.draw_without_rendering()
+    first, second = legend(picture.axes[0])
+    assert first.endswith("and 4 more")
+    assert first.count("±") == 6
+    assert second == "order 3: 0.5, 0.2, -0.3"
+    box = picture.axes[0].get_legend().get_window_extent()
+    page = picture.figure.bbox
+    assert (page.x0 <= box.x0, box.x1 <= page.x1, box.y1 <= page.y1) == (True, True, True)

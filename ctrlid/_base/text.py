@@ -70,6 +70,8 @@ def with_error(value: complex, error: float) -> str:
 
 def write_p_value(p: float) -> str:
     """Return a p-value in words; of the very small ones the size says nothing."""
+    if math.isnan(p):
+        return "p is not known"
     return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
 
 
@@ -152,7 +154,8 @@ def write_quantity(
     >>> write_quantity(6.1234e-4, "s", 3e-6), write_quantity(1.23456e-5, "m")
     ('0.6123 ± 0.0030 ms', '12.3 µm')
     """
-    factor, unit = choose_prefix(value, unit)
+    spread = error if error is not None and math.isfinite(error) else 0.0
+    factor, unit = choose_prefix(max(abs(value), spread), unit)
     if error is None or error == 0 or not math.isfinite(error):
         known = (
             "" if error is None else " (fixed)" if error == 0 else " (not determined by the data)"

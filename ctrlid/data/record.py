@@ -662,13 +662,15 @@ class Record(Printed):
             share = f"{100 * self.valid.mean():.1f} %"
             # Few among many would be rounded away.
             much = f"all but {np.sum(~self.valid)}" if share == "100.0 %" else share
-            rows[0] += f", {much} valid"
+            rows[0] += f", {much} valid; ranges of these:"
         channels = list_rows(self)
         numbered = [f"{k}[" for k, names in self.signals.items() if len(names) > 1]
         labels = [name if name == key or name.startswith(tuple(numbered)) else f"{key} ({name})"
-                  for key, name, _, _ in channels]  # fmt: skip
+                  for key, name, *_ in channels]  # fmt: skip
         width = max(map(len, labels))
-        for label, (_, _, unit, values) in zip(labels, channels, strict=True):
+        for label, (_, _, unit, every, counts) in zip(labels, channels, strict=True):
+            # What does not count, such as a dropout, says nothing of the range.
+            values = every[counts] if counts.any() else every
             rows.append(f"  {label:<{width}}  {values.min():.6g} .. {values.max():.6g} "
                         f"{'' if unit == '1' else unit}".rstrip())  # fmt: skip
         return "\n".join(rows)
@@ -698,14 +700,19 @@ def _write_no_instants(t: Any) -> str:
     )
 
 
-def list_rows(record: Record) -> list[tuple[str, str, str, Any]]:
-    """Return key, name, unit and samples of each single signal and extra channel of a record."""
-    rows = []
+def list_rows(record: Record) -> list[tuple[str, str, str, Any, Any]]:
+    """Return what a record has, signal by signal and channel by channel.
+
+    Each row is key, name, unit, samples, and which of the samples count.
+    """
+    rows: list[tuple[str, str, str, Any, Any]] = []
+    counts = record.valid_somewhere
     for key, names in record.signals.items():
         units = list_signals(key, record.units.get(key, ("",) * len(names)), len(names))
         each = np.reshape(getattr(record, key), (-1, len(record)))
-        rows += [(key, *row) for row in zip(names, units, each, strict=True)]
-    return [*rows, *((k, k, record.units.get(k, ""), v) for k, v in record.extra.items())]
+        own = record.valid_outputs if key == "y" else (counts,) * len(names)
+        rows += [(key, *row) for row in zip(names, units, each, own, strict=True)]
+    return [*rows, *((k, k, record.units.get(k, ""), v, counts) for k, v in record.extra.items())]
 
 
 def _rebuild(fields: dict[str, Any]) -> Record:

@@ -229,6 +229,9 @@ class Candidate:
     taken : bool
         Whether its round took it into the model. It need not be in the answer: a later step may
         have dropped it, or put another in its place. False in files of earlier versions.
+    record : int
+        Of several records that were diagnosed alone, the number of the one whose search this was,
+        from 1; else 0.
     """
 
     round: int
@@ -238,6 +241,12 @@ class Candidate:
     penalty: float
     remark: str = ""
     taken: bool = False
+    record: int = 0
+
+    @property
+    def round_name(self) -> str:
+        """The round in words, such as ``"round 1"`` or ``"record 2, round 1"``."""
+        return f"record {self.record}, round {self.round}" if self.record else f"round {self.round}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

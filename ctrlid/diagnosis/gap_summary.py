@@ -81,7 +81,7 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         shares[f.position] = _compute_share_closed(error**2 - left**2, smaller, floor.both)
     rows = (*results, start)
     if windows[0].record.y.ndim == 2:
-        gap = _summarize_several(loop, shared, rows, floor)
+        gap = _summarize_several(loop, shared, rows, floor, windows[0])
     else:
         unit = loop.known_units.get(loop.equations().outputs[0], "")
         gap = _make_gap(shared, rows, floor, unit, windows[0])
@@ -120,7 +120,7 @@ def replace_simulation(
     if blindness is None:
         return fresh, summary, ()
     how = choose_prediction(found.final.fitted, fresh.windows[0].record)
-    ahead = lengthen_horizon(loop, found, replace(fresh, how=how))
+    ahead = lengthen_horizon(loop, found, replace(fresh, how=how)).weigh_outputs(found.final)
     other = summarize_gap(loop, found, ahead)
     if not math.isfinite(other.gap.after):
         return fresh, summary, ()
@@ -143,21 +143,26 @@ def _find_blindness(found: Search, summary: GapSummary, fresh: FreshData) -> str
 
 
 def _summarize_several(
-    loop: Loop, shared: FreshData, rows: Sequence[Sequence[Array]], floor: gaps.Floor
-) -> Gap:
-    """Return the gap of all outputs in units of the floors, with that of each in its own unit."""
+    loop: Loop, shared: FreshData, rows: Sequence[Sequence[Array]], floor: gaps.Floor,
+    first: gaps.Window,
+) -> Gap:  # fmt: skip
+    """Return the gap of all outputs in units of the floors, with that of each in its own unit.
+
+    The curves are those of the `first` window, with what no model makes anything of.
+    """
     how, names = shared.how, loop.equations().outputs
-    whole = _make_gap(shared, rows, floor, "", shared.windows[0])
+    whole = _make_gap(shared, rows, floor, "", first)
     outputs = []
     for k, name in enumerate(names):
         part = FreshData(tuple(w.choose_output(k) for w in shared.windows), None, how)
         own = tuple(tuple(y[k] for y in each) for each in rows)
         unit = loop.known_units.get(name, "")
-        outputs.append(_make_gap(part, own, floor.outputs[k], unit, part.windows[0], name))
+        curves = first.choose_output(k)
+        outputs.append(_make_gap(part, own, floor.outputs[k], unit, curves, name))
     shown = max(outputs, key=lambda g: g.before / g.floor if g.floor > 0 else 0.0)
-    curves = {name: getattr(shown, name) for name in
-              ("time", "measured", "simulated_before", "simulated_after", "output")}  # fmt: skip
-    return replace(whole, **curves, outputs=tuple(outputs))
+    drawn = {name: getattr(shown, name) for name in
+             ("time", "measured", "simulated_before", "simulated_after", "output")}  # fmt: skip
+    return replace(whole, **drawn, outputs=tuple(outputs))
 
 
 def _make_gap(

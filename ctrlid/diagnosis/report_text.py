@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 # Lines of the report have at most so many characters, which fits a terminal.
 WIDTH = 100
+# Beside names of any length, words have so many characters at least.
+NARROW = 30
 
 
 def write_report_text(found: Diagnosis) -> str:
@@ -94,12 +96,13 @@ def _write_where(found: Diagnosis) -> list[str]:
     rows = [f"{head:<79}{'there' if same else 'before':>10}"
             f"{'' if same else 'after':>10}"]  # fmt: skip
     for place in places:
-        first, *more = textwrap.wrap(wording.describe_place(place), 72 - wide) or [""]
+        room = max(72 - wide, NARROW)
+        first, *more = textwrap.wrap(wording.describe_place(place), room) or [""]
         before, after = (
             write_number(wording.find_told_rms(place, v), 3) for v in (place.before, place.after)
         )
         after = "" if same else after
-        rows.append(f"    {place.axis:<{wide}} {first:<{74 - wide}}{before:>10}{after:>10}")
+        rows.append(f"    {place.axis:<{wide}} {first:<{room + 2}}{before:>10}{after:>10}")
         rows += [f"{'':<{wide + 5}}{line}" for line in more]
     return rows
 

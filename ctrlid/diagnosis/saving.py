@@ -15,7 +15,7 @@ import numpy as np
 from .._base.errors import CtrlidError
 from .._base.files import replace_file
 from ..effects import AbstractEffect
-from ..effects.base import name_at_place
+from ..effects.base import name_at_place, name_with_subject
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
 
@@ -50,7 +50,8 @@ class SavedLoop:
     parameters : dict of str to float
         Values of the parameters of plant and effects.
     units : dict of str to dict
-        Units of the parameters of effects, by class name, with the place where there are several.
+        Units of the parameters of effects, by class name, with what it acts on and its place where
+        there are several.
     known_units : dict of str to str
         Units of signals, states and parameters of the plant, by name.
     """
@@ -79,7 +80,9 @@ class SavedLoop:
 def list_units(loop: Loop | SavedLoop, effect: AbstractEffect) -> dict[str, str]:
     """Return the unit of each parameter of an effect, by a loop or by what was saved of it."""
     if isinstance(loop, SavedLoop):
-        return loop.units.get(name_at_place(effect), effect.units())
+        # Files of earlier versions do not tell effects on two states or parameters apart.
+        units = loop.units.get(name_with_subject(effect)) or loop.units.get(name_at_place(effect))
+        return units or effect.units()
     return effect.units(loop)
 
 
@@ -161,10 +164,10 @@ def _encode_loop(loop: Loop | SavedLoop) -> dict[str, Any]:
 
 
 def _list_effect_units(found: Diagnosis) -> dict[str, dict[str, str]]:
-    """Return the units of all effects that a diagnosis speaks of, by class name."""
+    """Return the units of all effects that a diagnosis speaks of, by what reports call them."""
     spoken = [*found.loop.effects, *(c.effect for c in found.ranking)]
     spoken += [e for f in found.added for e in (f.effect, *f.alternatives)]
-    return {name_at_place(e): list_units(found.loop, e) for e in spoken}
+    return {name_with_subject(e): list_units(found.loop, e) for e in spoken}
 
 
 # JSON has no such numbers, so that they are written as texts.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from .._base.text import with_error, write_list, write_number
+from .._base.text import with_error, write_list, write_number, write_quantity
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from .candidates import is_same_kind
@@ -49,12 +49,21 @@ def merge_diagnoses(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
     for f in findings:
         if not any(is_same_kind(f.effect, e) for e in complete.effects):
             complete = complete.with_effect(f.effect)
-    notes = list(dict.fromkeys(n for p in parts for n in p.notes))
+    notes = _merge_notes(parts)
+    alike = [k for k, p in enumerate(parts) if p.gap.name == lead.gap.name]
     notes.append(
         "the records do not lack the same effects, so each was diagnosed alone. The gap is that of "
-        "all records, on the last quarter of each. The table of where the error is and the curves "
-        f"of the picture are those of record {parts.index(lead) + 1}"
+        f"{_name_records(alike, len(parts))}, on the last quarter of each. The table of where the "
+        "error is, the curves of the picture, the sensor noise and the random force are those of "
+        f"record {parts.index(lead) + 1}"
     )
+    others = [f"that of record {k + 1} is the RMS error {_write_gap(p.gap)}"
+              for k, p in enumerate(parts) if k not in alike]  # fmt: skip
+    if others:
+        notes.append(
+            f"the {lead.gap.name} tells nothing in each record, and errors of different kinds have "
+            f"no mean: beside the gap above, {write_list(others)}"
+        )
     verdict, sentence = lead.verdict, _write_sentence(findings, len(parts))
     if differing:
         words = "; ".join(differing)
@@ -65,7 +74,7 @@ def merge_diagnoses(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
                     "The cause of this difference is not in the model.")  # fmt: skip
     return replace(
         lead, verdict=verdict, sentence=sentence, findings=findings, loop=complete,
-        gap=_merge_gaps(lead.gap, [p.gap for p in parts]), ranking=_merge_rankings(parts),
+        gap=_merge_gaps(lead.gap, [parts[k].gap for k in alike]), ranking=_merge_rankings(parts),
         calibrated=calibrated,
         tests={name: min(p.tests.get(name, 1.0) for p in parts) for name in lead.tests},
         notes=tuple(notes),
@@ -181,7 +190,7 @@ def _write_sentence(findings: Sequence[Finding], records: int) -> str:
 
 
 def _merge_gaps(lead: Gap, parts: Sequence[Gap]) -> Gap:
-    """Return the RMS over all records; the curves are those of one."""
+    """Return the RMS over records whose gaps are of one kind; the curves are those of one."""
     weights = np.array([p.samples or len(p.time) for p in parts], dtype=float)
 
     def rms(name: str) -> float:
@@ -198,8 +207,28 @@ def _merge_gaps(lead: Gap, parts: Sequence[Gap]) -> Gap:
 
 
 def _merge_rankings(parts: Sequence[Diagnosis]) -> tuple[Candidate, ...]:
-    rows: list[Candidate] = []
-    for p in parts:
-        done = max((c.round for c in rows), default=0)
-        rows += [replace(c, round=c.round + done) for c in p.ranking]
-    return tuple(rows)
+    return tuple(replace(c, record=k) for k, p in enumerate(parts, 1) for c in p.ranking)
+
+
+def _merge_notes(parts: Sequence[Diagnosis]) -> list[str]:
+    """Return the notes of all, each with the records that it is of where it is not of all."""
+    where: dict[str, list[int]] = {}
+    for k, p in enumerate(parts):
+        for note in dict.fromkeys(p.notes):
+            where.setdefault(note, []).append(k)
+    return [
+        note if len(ks) == len(parts) else f"{_name_records(ks, len(parts))}: {note}"
+        for note, ks in where.items()
+    ]
+
+
+def _name_records(numbers: Sequence[int], records: int) -> str:
+    if len(numbers) == records:
+        return "all records"
+    return f"record{'s' if len(numbers) > 1 else ''} {write_list([str(k + 1) for k in numbers])}"
+
+
+def _write_gap(gap: Gap) -> str:
+    sizes = [write_quantity(v, gap.unit) for v in (gap.before, gap.after, gap.floor)]
+    return (f"of the {gap.name}, {sizes[0]} before, {sizes[1]} with the effects and {sizes[2]} "
+            "from noise alone")  # fmt: skip

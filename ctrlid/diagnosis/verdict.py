@@ -306,7 +306,8 @@ def write_conclusion(
         text += f" {grounds[:1].upper()}{grounds[1:]}."
     left = [w for w in where if w.p_after < THRESHOLD.surely_left]
     if left and verdict in ("partly explained", "unknown"):
-        text += f" The remaining error depends on {' and '.join(w.axis for w in left[:2])}."
+        axes = list(dict.fromkeys(w.axis for w in left))[:2]
+        text += f" The remaining error depends on {' and '.join(axes)}."
     told = verdict == "unknown" and not stand_ins and doubted
     if disturbance.large and not told:
         kind = "a random force"

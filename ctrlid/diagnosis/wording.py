@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 PLACES = 3
 # So many failed tests are named, which still makes one sentence.
 LISTED = 4
+# From here on a size is written with an exponent.
+LONG = 1e6
 # The heading of what does not stand.
 STAND_INS = "what only describes part of the record"
 HEADLINES = {
@@ -250,7 +252,8 @@ def _list_rows(gap: Gap) -> list[tuple[str, str, str]]:
     places = 2 - math.floor(math.log10(factor * min(known))) if known else 0
 
     def size(value: float) -> str:
-        if math.isfinite(value) and places <= 6:
+        # Beyond so many digits a model diverges, and an exponent says so in fewer.
+        if math.isfinite(value) and places <= 6 and abs(factor * value) < LONG:
             return f"{factor * value:.{max(places, 0)}f} {unit}".strip()
         if math.isfinite(value):
             return f"{write_number(factor * value, 3)} {unit}".strip()
@@ -260,11 +263,14 @@ def _list_rows(gap: Gap) -> list[tuple[str, str, str]]:
         ratio = value / gap.floor if gap.floor > 0 else math.nan
         if not math.isfinite(ratio):
             return ""
+        if ratio >= LONG:
+            return f"{write_number(ratio, 3)} x the floor"
         return f"{ratio:.2f} x the floor" if ratio < 9.995 else f"{ratio:.0f} x the floor"
 
-    cases = (("the model as given", gap.given), ("recalibrated", gap.fitted),
-             ("with the effects", gap.after))  # fmt: skip
-    shown = cases[:2] if gap.after == gap.fitted else cases
+    shown = [("the model as given", gap.given)]
+    # A model without free parameters is not recalibrated, and nothing need be missing.
+    for label, value in (("recalibrated", gap.fitted), ("with the effects", gap.after)):
+        shown += [(label, value)] if value != shown[-1][1] else []
     rows = [(label, size(value), times(value)) for label, value in shown]
     if gap.kind == "prediction" and math.isfinite(gap.trivial):
         rows.append(("last value or line", size(gap.trivial), times(gap.trivial)))
@@ -279,6 +285,13 @@ def _is_at_floor(size: float, gap: Gap) -> bool:
     return size < THRESHOLD.near_floor * gap.floor
 
 
+def _name_runs(gap: Gap) -> str:
+    """Say what noise alone does to the kind of reproduction that a gap is of."""
+    if gap.kind == "prediction":
+        return "By noise alone, the predictions of the completed model err"
+    return "Two simulations of the completed model that differ only in their noise differ"
+
+
 def describe_shrinking(gap: Gap) -> str:
     """Say how much of the gap above the noise floor the effects close; empty if they do not."""
     if gap.fitted == gap.after:
@@ -288,13 +301,11 @@ def describe_shrinking(gap: Gap) -> str:
         return ""
     if THRESHOLD.excess * gap.floor < gap.after < THRESHOLD.excess * gap.widest:
         widest = write_quantity(gap.widest, gap.unit)
-        return ("Two simulations of the completed model that differ only in their noise differ by "
-                f"up to {widest}. So the gap hardly shows the benefit of the effects; the one-step "
-                "errors show it.")  # fmt: skip
+        return (f"{_name_runs(gap)} by up to {widest}. So the gap hardly shows the benefit of the "
+                "effects; the one-step errors show it.")  # fmt: skip
     if _is_at_floor(gap.before, gap) and _is_at_floor(gap.after, gap):
-        return ("Two simulations of the completed model that differ only in their noise differ by "
-                "as much. So the gap cannot show the benefit of the effects; the one-step errors "
-                "show it.")  # fmt: skip
+        return (f"{_name_runs(gap)} by as much. So the gap cannot show the benefit of the effects; "
+                "the one-step errors show it.")  # fmt: skip
     if above <= 0 or gap.after >= gap.before:
         return "On these samples the effects do NOT REDUCE THE GAP."
     share = min((gap.before**2 - gap.after**2) / above, 1.0)
@@ -402,7 +413,7 @@ def _describe_parameter_of_plant(
     found: Diagnosis, effect: ParameterError, error: float | None
 ) -> str:
     """Write the right value of a parameter of the plant, and the value that the model has."""
-    given, unit = found.loop.parameters[effect.name], found.loop.units.get(effect.name, "")
+    given, unit = found.loop.parameters[effect.name], found.loop.known_units.get(effect.name, "")
     spread = None if error is None else abs(given) * error
     value = write_quantity(given * (1 + effect.error), unit, spread)
     return f"{effect.name} = {value} in place of {_write_alike(given, unit, spread)}"

@@ -22,6 +22,8 @@ from ..validation.comparison import Comparison
 WINDOW = 250
 # So many candidates of a round are drawn.
 BARS = 7
+# So many poles are listed in a legend, a pair of conjugates as one.
+POLES = 6
 LEAST = -10.0  # A net gain below says no more than this one.
 
 
@@ -96,6 +98,25 @@ def find_poles(model: Any, dt: float) -> Any:
     return poles[np.lexsort((-poles.imag, -poles.real))]
 
 
+def list_poles(places: Any) -> str:
+    """Return poles in words, a pair of conjugates once, and of many the first.
+
+    Examples
+    --------
+    >>> list_poles(np.array([1.2, 0.5 + 0.1j, 0.5 - 0.1j]))
+    '1.2, 0.5±0.1j'
+    """
+    listed = []
+    for p in places:
+        paired = p.imag and np.isclose(p.conjugate(), places, rtol=1e-9, atol=0).any()
+        if paired and p.imag < 0:
+            continue
+        pair = f"{p.real:.4g}±{p.imag:.4g}j"
+        listed.append(pair if paired else _text.write_number(p, 4))
+    left = len(listed) - POLES
+    return ", ".join([*listed[:POLES], *([f"and {left} more"] if left > 0 else [])]) or "none"
+
+
 def make_frequency_grid(models: Mapping[str, Any]) -> Any:
     """Return a grid from well below the slowest to well above the fastest pole or zero."""
     corners, limits = [], []
@@ -168,8 +189,8 @@ class Bar:
     fitted: bool = True
 
 
-def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
-    """Return the best candidates of each round as bars, the best first."""
+def make_ranking(found: Diagnosis) -> dict[str, list[Bar]]:
+    """Return the best candidates of each round as bars, the best first, by the round in words."""
     value = {id(c): _compute_net_gain(c) for c in found.ranking}
     kinds: dict[int, Kind] = {}
     evidence: dict[int, float] = {}
@@ -179,27 +200,28 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
         own = [c for c in found.ranking
                if name_with_subject(c.effect) == name_with_subject(finding.effect)
                and value[id(c)] > 0 and id(c) not in kinds]  # fmt: skip
-        earned = [c for c in own if value[id(c)] > THRESHOLD.gate] or own
-        if not earned:
-            continue
-        taken = max(earned, key=lambda c: (c.taken, c.round))
-        stands = finding in found.findings
-        kinds[id(taken)] = "found" if stands else "in the model, but its name does not stand"
-        evidence[id(taken)] = finding.evidence
         others = {name_with_subject(e) for e in finding.alternatives}
-        for c in found.ranking:
-            alike = (
-                name_with_subject(c.effect) in others
-                or name_at_place(c.effect) in finding.equivalents
-            )
-            if c.round == taken.round and alike:
-                kinds.setdefault(id(c), "not told apart")
-    rounds: dict[int, list[Bar]] = {}
-    for number in sorted({c.round for c in found.ranking}):
-        tried = sorted((c for c in found.ranking if c.round == number),
+        # Records that were diagnosed alone have a search each.
+        for record in {c.record for c in own} & {0, *finding.records}:
+            searched = [c for c in own if c.record == record]
+            earned = [c for c in searched if value[id(c)] > THRESHOLD.gate] or searched
+            taken = max(earned, key=lambda c: (c.taken, c.round))
+            stands = finding in found.findings
+            kinds[id(taken)] = "found" if stands else "in the model, but its name does not stand"
+            evidence[id(taken)] = finding.evidence
+            for c in found.ranking:
+                alike = (
+                    name_with_subject(c.effect) in others
+                    or name_at_place(c.effect) in finding.equivalents
+                )
+                if (c.record, c.round) == (record, taken.round) and alike:
+                    kinds.setdefault(id(c), "not told apart")
+    rounds: dict[str, list[Bar]] = {}
+    for record, number in sorted({(c.record, c.round) for c in found.ranking}):
+        tried = sorted((c for c in found.ranking if (c.record, c.round) == (record, number)),
                        key=lambda c: (id(c) not in kinds, -value[id(c)]))  # fmt: skip
         shown = sorted(tried[:BARS], key=lambda c: -value[id(c)])
-        rounds[number] = [
+        rounds[tried[0].round_name] = [
             Bar(name_with_subject(c.effect), value[id(c)], kinds.get(id(c), _tell_kind(c)),
                 evidence.get(id(c), math.nan), math.isfinite(c.gain))
             for c in shown
@@ -229,7 +251,7 @@ REASONS: dict[Kind, str] = {
 }  # fmt: skip
 
 
-def explain_bars(rounds: Mapping[int, Sequence[Bar]]) -> str:
+def explain_bars(rounds: Mapping[str, Sequence[Bar]]) -> str:
     """Say why candidates beyond the line need not be names; empty where there are none."""
     beyond = {bar.kind for bars in rounds.values() for bar in bars
               if bar.net_gain > THRESHOLD.gate} - {"found"}  # fmt: skip

@@ -11,6 +11,7 @@ from ..data.record import Record, list_rows
 from ..design.controller_trial import ControllerTrial
 from ..design.redesigning import Redesign
 from ..diagnosis import wording
+from ..diagnosis.findings import BinnedErrors
 from ..diagnosis.result import Diagnosis
 from ..effects.base import name_with_subject
 from ..estimation.identified_model import Estimate, IdentifiedModel, IdentifiedSystem
@@ -155,11 +156,13 @@ def make_blocks(result: Any) -> list[Block]:
 
 
 def _make_record_table(record: Record) -> Table:
-    rows = tuple(
-        (name, unit or "not given", *(f"{f(v):.6g}" for f in (np.min, np.mean, np.max, np.std)))
-        for _, name, unit, v in list_rows(record)
-    )
-    valid = "" if record.valid.all() else f", {100 * record.valid.mean():.1f} % of them valid"
+    rows = []
+    for _, name, unit, every, counts in list_rows(record):
+        values = every[counts] if counts.any() else every
+        numbers = (f"{f(values):.6g}" for f in (np.min, np.mean, np.max, np.std))
+        rows.append((name, unit or "not given", *numbers))
+    share = f"{100 * record.valid.mean():.1f} %"
+    valid = "" if record.valid.all() else f", {share} of them valid, whose numbers are these"
     between = BETWEEN[record.hold]
     caption = (
         f"{_text.write_count(len(record), 'sample')} at {record.dt:g} s, {record.duration:.4g} s "
@@ -167,7 +170,7 @@ def _make_record_table(record: Record) -> Table:
         f"u {between} between samples."
     )
     head = ("signal", "unit", "smallest", "mean", "largest", "standard deviation")
-    return Table(head, rows, caption)
+    return Table(head, tuple(rows), caption)
 
 
 def _make_audit_blocks(found: Audit) -> list[Block]:
@@ -283,13 +286,13 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     if found.where:
         made.append(Title("Where the error is"))
     made += [
-        f"{_upper(p.axis)}: {wording.describe_place(p)}."
+        f"{_name_place(p)}: {wording.describe_place(p)}."
         for p in wording.list_telling_places(found)
     ]
     sides = 2 if found.added else 1
     places = tuple(
         (
-            p.axis,
+            _name_place(p),
             *(
                 _text.write_number(wording.find_told_rms(p, v), 3)
                 for v in (p.before, p.after)[:sides]
@@ -301,8 +304,8 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     if places:
         columns = (
             "in bins of",
-            *("before", "after")[:sides],
-            *("p-value before", "p-value after")[:sides],
+            *(("before", "after") if found.added else ("RMS",)),
+            *(("p-value before", "p-value after") if found.added else ("p-value",)),
         )
         made.append(Table(columns, places, PLACES))
     if found.verdict == "nothing missing" and found.sensitivity:
@@ -311,6 +314,7 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     made.append(Title("Parameters, noise and remarks"))
     parameters = tuple(
         (c.name, f"{c.given:.6g}", f"{c.before:.6g}", f"{c.after:.6g}",
+         "on its bound" if c.standard_error == 0 else
          f"{c.standard_error:.2g}" if np.isfinite(c.standard_error) else "not in the data")
         for c in found.calibrated
     )  # fmt: skip
@@ -332,7 +336,8 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     made += [f"{remark.rstrip('.')}." for remark in found.audit]
     made += [f"Note: {remark.rstrip('.')}." for remark in found.notes]
     tried = tuple(
-        (name_with_subject(c.effect), str(c.round), f"{c.gain:.1f}", f"{c.penalty:.1f}", c.remark)
+        (name_with_subject(c.effect), c.round_name.removeprefix("round "), f"{c.gain:.1f}",
+         f"{c.penalty:.1f}", c.remark)
         for c in found.ranking if np.isfinite(c.gain)
     )  # fmt: skip
     if tried:
@@ -342,6 +347,11 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
         rows = tuple(row[:width] for row in tried)
         made += [Title("What was tried"), Table(heads, rows, "The candidates that were refitted.")]
     return [block for block in made if block]
+
+
+def _name_place(place: BinnedErrors) -> str:
+    """Name the quantity that errors are binned by, and of several outputs whose errors they are."""
+    return f"{place.axis}, errors of {place.output}" if place.output else place.axis
 
 
 def _upper(text: str) -> str:

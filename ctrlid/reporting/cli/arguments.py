@@ -33,6 +33,7 @@ PLANTS = {"maglev": ("K",), "servo": ("c", "k"), "tank": ("outlet", "k"), "pendu
 CHANNELS = ("r", "u", "y", "time")
 NEXT_NAME = re.compile(r"[,\s]+(?=\w+\s*=)")
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+WHOLE = re.compile(r"\s*[+-]?(0|[1-9]\d*)\s*")
 SYSTEMS = (ct.NonlinearIOSystem, ct.StateSpace, ct.TransferFunction)
 
 
@@ -72,19 +73,46 @@ def read_loop(args: argparse.Namespace, record: Record) -> Loop:
     free = PLANTS.get(args.model, ()) if args.free is None else _join_names(args.free)
     _require_known(args.model, list(trace(model).parameters), [*values, *free])
     model = with_parameters(model, values) if values else model
-    output = float(np.mean(record.y[record.valid])) if args.at_output is None else args.at_output
+    output = _take_values("--at-output", args.at_output, trace(model).outputs)
+    bias = _take_values("--input-bias", args.input_bias, trace(model).inputs)
+    means = _take_means(record, "y", record.valid_outputs)
     # A linear model acts on deviations from the means of the record.
     if isinstance(model, ct.TransferFunction | ct.StateSpace):
-        at = OperatingPoint((), float(np.mean(record.u[record.valid])), output)
+        usual = _take_means(record, "u", record.valid_somewhere)
+        at = OperatingPoint((), usual, means if output is None else output)
+    elif output is None and isinstance(means, tuple):
+        # A plant need not rest where the means of several outputs are.
+        names = ", ".join(record.signals["y"])
+        raise CtrlidError(f"the model has {len(means)} outputs ({names}), and where it rests is "
+                          "not known: give --at-output with a value for each, as in --at-output "
+                          f"{','.join(['0'] * len(means))}")  # fmt: skip
     else:
         with options_in_refusals():
-            at = operating_point(model, output=output)
-    if args.input_bias is not None:
-        at = dataclasses.replace(at, input=args.input_bias)
+            at = operating_point(model, output=means if output is None else output)
+    if bias is not None:
+        at = dataclasses.replace(at, input=bias)
     given_controller = None if args.controller is None else read_controller(args.controller)
     with options_in_refusals():
         loop = Loop(model, given_controller, dt=record.dt, at=at, free=free)
     return loop if args.input_bias is not None else take_bias_from_log(loop, record)
+
+
+def _take_values(option: str, given: Sequence[float] | None, names: Sequence[str]) -> Any:
+    """Return what an option gives for each signal, a number where there is one; None without."""
+    if given is None:
+        return None
+    if len(given) != len(names):
+        raise CtrlidError(f"{option} takes a number for each of {', '.join(names)}, with commas "
+                          f"between them and decimal points; given {len(given)}")  # fmt: skip
+    return tuple(given) if len(given) > 1 else given[0]
+
+
+def _take_means(record: Record, key: str, counts: Any) -> Any:
+    """Return the mean of each signal over the samples that count, a number where there is one."""
+    rows = np.reshape(getattr(record, key), (-1, len(record)))
+    each = zip(rows, np.broadcast_to(counts, rows.shape), strict=True)
+    means = tuple(float(np.mean(row[use])) for row, use in each)
+    return means if len(means) > 1 else means[0]
 
 
 def read_plant(text: str, values: dict[str, float]) -> Any:
@@ -269,6 +297,14 @@ def parse_decimal(text: str) -> float:
         return _parse_number("it", text)
     except CtrlidError as reason:  # argparse prints what it is told in its own error alone.
         raise argparse.ArgumentTypeError(str(reason)) from reason
+
+
+def parse_decimals(text: str) -> tuple[float, ...]:
+    """Read NUMBER or NUMBER,NUMBER; what looks like one with a decimal comma is refused."""
+    parts = text.split(",")
+    if DECIMAL_COMMA.fullmatch(text.strip()) and not all(map(WHOLE.fullmatch, parts)):
+        parts = [text]
+    return tuple(parse_decimal(part) for part in parts)
 
 
 def parse_names(text: str) -> list[str]:

@@ -24,6 +24,7 @@ from .arguments import (
     parse_assignment,
     parse_assignments,
     parse_decimal,
+    parse_decimals,
     parse_names,
     read_loop,
     read_record,
@@ -85,9 +86,10 @@ def add_parser(commands: Any) -> None:
         help="uncertain parameters of the model, which are fitted first, as in --free K m or "
         "--free K,m (default: "
         + ", ".join(f"{' and '.join(v)} of {k}" for k, v in PLANTS.items()) + ")")  # fmt: skip
-    add("--at-output", type=parse_decimal, metavar="Y",
-        help="output at the operating point (default: the mean of y)")  # fmt: skip
-    add("--input-bias", type=parse_decimal, metavar="U",
+    add("--at-output", type=parse_decimals, metavar="Y",
+        help="output at the operating point, of several outputs each, as in 0.1,0 (default: the "
+        "mean of y)")  # fmt: skip
+    add("--input-bias", type=parse_decimals, metavar="U",
         help="bias that the controller adds to u (default: as the log has it where the controller "
         "is known, else the input that holds the model at rest)")  # fmt: skip
     add("--dt", type=parse_decimal, metavar="S",
@@ -139,7 +141,9 @@ def add_parser(commands: Any) -> None:
     add("--seconds", type=parse_decimal, metavar="S",
         help="end the search after so many seconds with the best answer so far (default: when it "
         "is finished). Ctrl-C does the same at once")  # fmt: skip
-    add("--quiet", action="store_true", help="show no progress on the terminal")
+    # Without a default, what was given before the command stays.
+    add("--quiet", action="store_true", default=argparse.SUPPRESS,
+        help="show no progress on the terminal")  # fmt: skip
     parser.set_defaults(run=run_diagnosis)
 
 
@@ -162,28 +166,37 @@ def run_diagnosis(args: argparse.Namespace) -> int:
     settings: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
     if args.validation is not None:
         settings["validation"] = read_record(args.validation, args)
+    own = args.save is not None and args.save.is_dir()
     folder = None if args.save is None else make_folder(args.save, "--save")
     try:
         with _stop_on_interrupt() as budget, options_in_refusals():
             found = diagnose(loop, record, progress=not args.quiet, **settings)
     except BaseException:
-        if folder is not None:
+        if folder is not None and not own:
             folder.rmdir()
         raise
-    # What took minutes to find is saved before a terminal can refuse to show it.
-    where = "" if folder is None else _save_files(found, folder)
-    sys.stdout.write(f"{found}\n{where}")
+    # What took minutes to find is saved before a terminal can refuse to show it, and shown even
+    # where it cannot be saved.
+    where = ""
+    try:
+        where = "" if folder is None else _save_files(found, folder)
+    finally:
+        sys.stdout.write(f"{found}\n{where}")
     return INTERRUPTED if budget.asked else 0
 
 
 def _save_files(found: Diagnosis, folder: Path) -> str:
     """Write all that is kept of a diagnosis into a folder, and say so."""
-    found.save(folder / "diagnosis.json")
-    with replace_file(folder / "report.txt") as file:
-        file.write(f"{found}\n")
-    with off_screen(), replace_file(folder / "diagnosis.png", binary=True) as file:
-        file.write(plot.png(plot.diagnosis(found)))
-    write_report(found, folder / "report.html")
+    try:
+        found.save(folder / "diagnosis.json")
+        with replace_file(folder / "report.txt") as file:
+            file.write(f"{found}\n")
+        with off_screen(), replace_file(folder / "diagnosis.png", binary=True) as file:
+            file.write(plot.png(plot.diagnosis(found)))
+        write_report(found, folder / "report.html")
+    except OSError as reason:
+        raise CtrlidError(f"not all of the answer is saved in {folder}: {reason}. It is in the "
+                          "report on the terminal; keep that") from reason  # fmt: skip
     files = "report.html, report.txt, diagnosis.png and diagnosis.json"
     return f"{files} are in {folder}{os.sep}\n"
 

@@ -108,8 +108,10 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     above.plot(t, scale * y, label="measured", **MEASURED)
     names = " and ".join(name_with_subject(f.effect) for f in found.added[:2])
     names += f" and {len(found.added) - 2} more" if len(found.added) > 2 else ""
-    start = "recalibrated model" if gap.before == gap.fitted else "model as given"
-    label = "before" if names or gap.before != gap.fitted else "recalibrated"
+    # A model without free parameters is not recalibrated.
+    changed = gap.before == gap.fitted != gap.given
+    start = "recalibrated model" if changed else "model as given"
+    label = "recalibrated" if changed and not names else "before"
     cases = [(label, gap.simulated_before, gap.before, BEFORE if names else AFTER)]
     if names:
         cases.append(("after", gap.simulated_after, gap.after, AFTER))
@@ -152,7 +154,8 @@ def _draw_errors(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
     before, after = np.sqrt(place.before), np.sqrt(place.after)
     both = bool(found.added)
     # Bins hold equally many samples each, so that they are of unequal width.
-    filled, label = (after, "after") if both else (before, "recalibrated")
+    alone = "recalibrated" if found.calibrated else "model as given"
+    filled, label = (after, "after") if both else (before, alone)
     ax.stairs(np.nan_to_num(filled), edges, fill=True, color=COLOURS[0], alpha=0.55, label=label)
     ax.stairs(filled, edges, color=COLOURS[0], linewidth=0.8)
     if both:
@@ -190,12 +193,12 @@ def _space_ticks(ax: Any, edges: Array) -> list[float]:
     return sorted(kept)
 
 
-def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
+def _draw_ranking(ax: Any, rounds: Mapping[str, Sequence[_pictures.Bar]]) -> None:
     """Draw the net gain of each candidate as bars, round below round."""
     labels, row, drawn = [], 0, set()
     top = max((bar.net_gain for bars in rounds.values() for bar in bars), default=0.0)
-    for number, bars in rounds.items():
-        ax.text(0.0, row, f" round {number}", ha="left", va="center", style="italic",
+    for name, bars in rounds.items():
+        ax.text(0.0, row, f" {name}", ha="left", va="center", style="italic",
                 fontsize="small", transform=ax.get_yaxis_transform())  # fmt: skip
         labels.append("")
         row += 1
@@ -205,6 +208,8 @@ def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> Non
             # The gain of what no fit has confirmed is told as the estimate that it is.
             about = "" if bar.fitted else "about "
             words = f"{about}{round(bar.net_gain)}"
+            if bar.net_gain <= _pictures.LEAST:
+                words = f"below {_pictures.LEAST:g}"
             if np.isfinite(bar.evidence):
                 words += f"; evidence {bar.evidence:.0f}"
             ax.annotate(words, (max(bar.net_gain, 0.0), row), (3, 0), va="center",

@@ -1,11 +1,11 @@
 """Models: poles, frequency responses, and their trend over set-points."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
 from matplotlib.ticker import MultipleLocator
 
-from ..._base import text as _text
 from ..._base.arguments import explain_names
 from ..._base.arrays import Array, to_real_array
 from ..._base.errors import CtrlidError
@@ -15,6 +15,9 @@ from ...estimation.series import FitSeries
 from ...physics.trace import timebase
 from .. import pictures as _pictures
 from .axes import COLOURS, MARKERS, Picture, choose_line_style, finish_axes, require_kind, take_axes
+
+# A legend of poles is broken after so many characters.
+LEGEND_WIDTH = 60
 
 
 @explain_names
@@ -73,9 +76,9 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Picture:
         if label in models:
             style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)],
                      "markersize": 8, "markerfacecolor": "none", "zorder": 3}  # fmt: skip
-        listed = ", ".join(_text.write_number(p, 4) for p in places) or "none"
-        ax.plot(places.real, places.imag, linestyle="none", markeredgewidth=1.8,
-                label=f"{label}: {listed}", **style)  # fmt: skip
+        words = textwrap.fill(f"{label}: {_pictures.list_poles(places)}", LEGEND_WIDTH)
+        ax.plot(places.real, places.imag, linestyle="none", markeredgewidth=1.8, label=words,
+                **style)  # fmt: skip
     _choose_view(ax, np.concatenate([*found.values(), [1.0 if dt else 0.0]]))
     plane, unit = ("z", "1") if dt else ("s", "rad/s")
     ax.set_xlabel(f"real part of {plane} [{unit}]")

@@ -32,10 +32,11 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
     """Draw an experiment: reference and output, the input below, and extra channels on request.
 
     Of several outputs each has axes of its own, with the reference of its name, or else the one of
-    its number where there are as many references as outputs; so has each of several inputs, and a
-    reference that belongs to no output, such as that of a state.
-    Stretches that do not count are shaded. A long record is drawn as the band between the smallest
-    and the largest value of neighbouring samples, so that no peak is lost.
+    its number where there are as many references as outputs, unless its unit is another one; so has
+    each of several inputs, and a reference that belongs to no output, such as that of a state.
+    Stretches that do not count are shaded, and do not set the scale. A long record is drawn as the
+    band between the smallest and the largest value of neighbouring samples, so that no peak is
+    lost.
 
     Parameters
     ----------
@@ -79,29 +80,29 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
     outputs, references, inputs = (
         [row[1:] for row in rows if row[0] == key] for key in ("y", "r", "u")
     )
-    followed = [_find_reference(references, k, name, len(outputs))
-                for k, (name, _, _) in enumerate(outputs)]  # fmt: skip
+    followed = [_find_reference(references, k, row, len(outputs)) for k, row in enumerate(outputs)]
     alone = [row for row in references if all(row is not one for one in followed)]
     axes = take_axes(ax, len(outputs) + len(alone) + len(inputs) + len(extra), sharex=True)
-    for ax, (name, unit, values), wanted in zip(axes, outputs, followed, strict=False):
-        both = [values] if wanted is None else [values, wanted[2]]
+    for ax, (name, unit, values, counts), wanted in zip(axes, outputs, followed, strict=False):
+        both = [_keep(values, counts)] + ([] if wanted is None else [_keep(*wanted[2:])])
         scale, unit = _pictures.choose_scale(both, unit)
         _draw_trace(ax, record, scale * values, 0, f"measured {name}")
         if wanted is not None:
             label = wanted[0] if wanted[0] != "r" else ""
             _draw_trace(ax, record, scale * wanted[2], 1, f"reference {label}", True)
         ax.set_ylabel(f"{name} [{unit}]")
-    panels = [(1, f"reference {name}", name, values, unit, True) for name, unit, values in alone]
-    others = [(f"input {name}", name, values, unit, record.hold == "zoh")
-              for name, unit, values in inputs]  # fmt: skip
-    others += [(key, key, record.extra[key], record.units.get(key, ""), False) for key in extra]
-    panels += [(2 + i, *panel) for i, panel in enumerate(others)]
-    for ax, (colour, label, name, values, unit, held) in zip(
+        _view_counted(ax, [scale * kept for kept in both])
+    panels = [(1, "reference ", True, row) for row in alone]
+    panels += [(2 + i, "input ", record.hold == "zoh", row) for i, row in enumerate(inputs)]
+    channels = {row[0]: row[1:] for row in rows if row[0] in record.extra}
+    panels += [(2 + len(inputs) + i, "", False, channels[k]) for i, k in enumerate(extra)]
+    for ax, (colour, kind, held, (name, unit, values, counts)) in zip(
         axes[len(outputs) :], panels, strict=True
     ):
-        scale, unit = _pictures.choose_scale([values], unit)
-        _draw_trace(ax, record, scale * values, colour % len(COLOURS), label, held)
+        scale, unit = _pictures.choose_scale([_keep(values, counts)], unit)
+        _draw_trace(ax, record, scale * values, colour % len(COLOURS), f"{kind}{name}", held)
         ax.set_ylabel(f"{name} [{unit}]")
+        _view_counted(ax, [scale * _keep(values, counts)])
     for ax in axes:
         _shade_gaps(ax, record)
         finish_axes(ax)
@@ -109,12 +110,30 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
     return Picture(axes)
 
 
-def _find_reference(references: Any, k: int, name: str, outputs: int) -> Any:
-    """Return name, unit and samples of the reference of an output, None if there is none."""
+def _find_reference(references: Any, k: int, output: Any, outputs: int) -> Any:
+    """Return the row of the reference of an output, None if there is none.
+
+    One in another unit, such as the volts of a set-point, is none that the axes of it could show.
+    """
+    name, unit = output[:2]
     alike = [row for row in references if row[0] == name]
-    if alike:
-        return alike[0]
-    return references[k] if len(references) == outputs else None
+    if not alike and len(references) == outputs:
+        alike = [references[k]]
+    return next((row for row in alike if not unit or not row[1] or row[1] == unit), None)
+
+
+def _keep(values: Array, counts: Array) -> Array:
+    """Return the samples that count, or all where none does."""
+    return values[counts] if counts.any() else values
+
+
+def _view_counted(ax: Any, counted: Sequence[Array]) -> None:
+    """Keep what counts readable wherever samples go that do not."""
+    low, high = min(v.min() for v in counted), max(v.max() for v in counted)
+    margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
+    bottom, top = ax.get_ylim()
+    if bottom < low - 2 * margin or top > high + 2 * margin:
+        ax.set_ylim(max(bottom, low - margin), min(top, high + margin))
 
 
 @explain_names
@@ -179,7 +198,8 @@ def _draw_curves(ax: Any, comparison: Comparison, shown: slice) -> None:
     """Draw the measured output and what is made of it, in the samples shown."""
     whole = comparison.record
     t = whole.t[shown]
-    scale, unit = _pictures.choose_scale([whole.y[shown]], whole.units.get("y", ""))
+    counted = _keep(whole.y[shown], whole.valid[shown])
+    scale, unit = _pictures.choose_scale([counted], whole.units.get("y", ""))
     y = scale * whole.y[shown]
     ax.plot(t, y, label=f"measured {whole.names.get('y', 'y')}", **MEASURED)
     lines = []
@@ -189,7 +209,7 @@ def _draw_curves(ax: Any, comparison: Comparison, shown: slice) -> None:
         kept = np.isfinite(values) | ~whole.valid[shown]
         label = f"{curve.label}: fit {write_fit(curve.fit, 1)}"
         lines += ax.plot(t[kept], values[kept], label=label, **choose_line_style(i))
-    limit_view(ax, y, lines)
+    limit_view(ax, scale * counted, lines)
     _shade_gaps(ax, whole[shown])
     ax.set_ylabel(f"{whole.names.get('y', 'y')} [{unit}]")
 
