@@ -10,6 +10,7 @@ import pytest
 import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from ctrlid._base.errors import CtrlidError
 from ctrlid.data.record import Record
@@ -610,3 +611,14 @@ def test_the_count_of_equations_is_that_of_the_regression(orders):
     (structure,) = list_structures(*orders, record).values()
     rows = build_arx_regression([record], structure).rows
     assert count_equations(record, structure) == rows > 100
+
+
+def test_an_iterator_of_records_is_checked_as_a_list_is():
+    """Its notes were left out, so that a bias was not told."""
+    rng = np.random.default_rng(1)
+    u = rng.choice([-1.0, 1.0], 800)
+    y = lfilter([0, 0.1, 0.1], [1, -1.5, 0.6], u) + 0.1 * rng.standard_normal(800)
+    records = [Record(u=u[s], y=y[s], dt=0.01) for s in (slice(400), slice(400, 800))]
+    whole = fit_arx(records, 2, 2).estimate
+    assert any("NOT WHITE" in note for note in whole.notes)
+    assert fit_arx(iter(records), 2, 2).estimate.notes == whole.notes

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+
+import control as ct
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import ctrlid as cid
 from ctrlid._base.errors import CtrlidError
@@ -21,7 +25,7 @@ from ctrlid.estimation.constraints.branches import (
     is_possible,
     list_cases,
 )
-from ctrlid.estimation.identified_model import Structure
+from ctrlid.estimation.identified_model import Structure, compute_root_errors
 
 Z2, Z3 = Structure(2, 2), Structure(3, 2)
 S2, S3 = Structure(2, 1, domain="s"), Structure(3, 1, domain="s")
@@ -296,3 +300,96 @@ def test_too_many_branches_are_refused():
 
     with pytest.raises(CtrlidError, match="more than 256 combinations of branches"):
         list_cases([Either(), Either()], Z2)
+
+
+# --- units
+
+
+def respond(scale, n=600):
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(n)
+    y = scale * (lfilter([0, 1, 2.0], [1, -1.5, 0.6], u) + 0.01 * rng.standard_normal(n))
+    return cid.Record(u=u, y=y, dt=0.1)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-10, 1e10])
+@pytest.mark.parametrize(
+    "known",
+    [
+        lambda s: [cid.Fixed("b1", s), cid.Fixed("b1", 6 * s)],
+        lambda s: [cid.Fixed("b1", s), cid.Bounds("b1", lower=6 * s)],
+        lambda s: [cid.Fixed("b1", s), cid.Fixed("b2", 2 * s), cid.Equal("b1", "b2")],
+        lambda s: [cid.Bounds("b1", lower=6 * s), cid.Bounds("b1", upper=2 * s)],
+    ],
+    ids=["two values", "value and bound", "equal", "two bounds"],
+)
+def test_contradictions_do_not_depend_on_units(scale, known):
+    """Coefficients around 1e-10, such as metres per volt, made any two facts agree."""
+    with pytest.raises(cid.CtrlidError, match="contradict each other"):
+        cid.fit_arx(respond(scale), 2, 2, constraints=known(scale))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-10, 1e10])
+def test_right_facts_do_not_contradict_each_other_in_any_unit(scale):
+    fit = functools.partial(cid.fit_arx, respond(scale), 2, 2)
+    known = [cid.StaticGain(30 * scale), cid.Fixed("a2", 0.6), cid.Bounds("a1", upper=-1.5)]
+    assert fit(constraints=known).estimate["b1"] == pytest.approx(scale, rel=0.01)
+    known = [cid.StaticGain(30 * scale), cid.PoleAt(0.75 + 0.1936j)]
+    assert fit(constraints=known).estimate["b1"] == pytest.approx(scale, rel=0.01)
+
+
+@pytest.mark.parametrize(("dt", "rates"), [(1e-6, (1e6, 2e6, 3e6)), (3600.0, (1e-6, 2e-6, 5e-6))])
+def test_known_poles_of_fast_and_slow_plants_are_taken(dt, rates):
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.choice([-1.0, 1.0], 160), 5)
+    plant = ct.tf([3 * np.prod(rates)], np.poly([-p for p in rates]))
+    y = ct.forced_response(ct.sample_system(ct.ss(plant), dt), np.arange(800) * dt, u).outputs
+    record = cid.Record(u=u, y=y + 1e-3 * rng.standard_normal(800), dt=dt)
+    known = [cid.StaticGain(3.0), *(cid.PoleAt(-p) for p in rates)]
+    fitted = cid.fit_continuous(record, 3, constraints=known).estimate
+    np.testing.assert_allclose(fitted.values[:3], np.poly([-p for p in rates])[1:], rtol=1e-9)
+
+
+def test_a_static_gain_of_an_input_that_there_is_not_is_refused():
+    with pytest.raises(cid.CtrlidError, match="speaks of the input 'nonsense'; the record has u"):
+        cid.fit_arx(respond(1.0), 2, 2, constraints=[cid.StaticGain(30.0, input="nonsense")])
+
+
+# --- poles that coincide
+
+
+def test_poles_that_a_constraint_merges_have_no_invented_errors():
+    """An invented 2.024e-07 +- 4e-09 rad/s was printed for a pair on its bound, and no warning."""
+    rng = np.random.default_rng(0)
+    u, e = rng.standard_normal(200), rng.standard_normal(200)
+    den = np.poly([0.97, 0.95, 0.5])
+    y = lfilter([0, 0.1, 0.1], den, u) + lfilter([1], den, 0.01 * e)
+    record = cid.Record(u=u, y=y, dt=0.1)
+    found = cid.fit_arx(record, 3, 2, constraints=[cid.ReciprocalPoles()]).estimate
+    merged = np.abs(found.poles - 1) < 1e-6
+    assert merged.sum() == 2
+    assert (found.poles_standard_errors[merged] == 0).all()
+    assert "NO POLE OUTSIDE THE UNIT CIRCLE" in str(found)
+
+
+def test_a_double_pole_on_a_bound_has_the_error_of_its_mean():
+    """It is at -a1/2, so that its error is half of that of a1."""
+    record = respond(1.0, 200)
+    real = cid.Nonlinear(inequality=lambda theta: [theta[1] - theta[0] ** 2 / 4])
+    found = cid.fit_arx(record, 2, 2, constraints=[real]).estimate
+    assert abs(found.poles[0] - found.poles[1]) < 1e-6
+    half = found.standard_errors[0] / 2
+    assert found.poles_standard_errors == pytest.approx([half, half], rel=1e-3)
+
+
+def test_a_double_pole_that_may_part_has_no_error_of_first_order():
+    errors = compute_root_errors(np.array([0.7, 0.7, 0.2]), np.diag([1e-4, 1e-4, 1e-4]))
+    assert np.isinf(errors[:2]).all()
+    assert np.isfinite(errors[2])
+
+
+def test_the_error_of_a_mean_is_that_of_the_coefficients():
+    """Two poles at 0.7 move together, a third one is held: a = -(2 p + 0.2) and so on."""
+    slope = np.array([-2.0, 2 * 0.7 + 2 * 0.2, -2 * 0.7 * 0.2])
+    errors = compute_root_errors(np.array([0.7, 0.7, 0.2]), 1e-6 * np.outer(slope, slope))
+    assert errors == pytest.approx([1e-3, 1e-3, 0.0], abs=1e-9)

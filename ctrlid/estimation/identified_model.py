@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -290,7 +291,7 @@ class Estimate(_text.Printed):
 
         ``dz/da_i = -z^(na-i) / A'(z)``. For a complex pole it is the root of the summed variances
         of its two parts. Where poles coincide there is no first-order answer: infinite, unless
-        the denominator is fixed.
+        they are held together, as on the bound of a constraint, where it is that of their mean.
         """
         na = self.structure.na
         return compute_root_errors(self.poles, self.covariance[:na, :na])
@@ -307,6 +308,13 @@ class Estimate(_text.Printed):
 
     def __str__(self) -> str:
         return _write_report(self)
+
+
+# Roots nearer to each other, relative to their size, cannot be told from multiple ones: rounding of
+# the coefficients parts a double root by the square root of the machine's precision.
+RESOLVED = 8 * math.sqrt(np.finfo(float).eps)
+# A share of the terms of a sum that is rounding beside a double root.
+PARTED = 1e-6
 
 
 def _are_at_zero(poles: Any) -> Any:
@@ -327,20 +335,52 @@ def compute_root_errors(roots: ComplexArray, covariance: Array) -> Array:
     Returns
     -------
     (n,) array
-        Standard errors; infinite where roots coincide, unless all coefficients are fixed.
+        Standard errors; of roots that coincide that of their mean where the coefficients can only
+        move so that they go on to coincide, and else infinite.
     """
     n = len(roots)
     if not covariance.any():
         return np.zeros(n)
+    powers, spread = np.arange(n - 1, -1, -1), np.sqrt(np.diag(covariance))
     errors = np.empty(n)
     for k in range(n):
-        slope = np.prod(roots[k] - np.delete(roots, k))
-        if slope == 0:
+        alike = np.abs(roots - roots[k]) <= RESOLVED * np.maximum(np.abs(roots), np.abs(roots[k]))
+        if alike.sum() == 1:
+            gradient = -(roots[k] ** powers) / np.prod(roots[k] - np.delete(roots, k))
+            errors[k] = _compute_spread(gradient, covariance)
+            continue
+        # At a multiple root a change of the polynomial's value there parts the roots.
+        apart = roots[alike].mean() ** powers
+        if _compute_spread(apart, covariance) > PARTED * (np.abs(apart) @ spread):
             errors[k] = np.inf
             continue
-        gradient = -(roots[k] ** np.arange(n - 1, -1, -1)) / slope
-        errors[k] = np.sqrt(max(float((gradient.conj() @ covariance @ gradient).real), 0.0))
+        gradient = _differentiate_mean(roots, alike)
+        error = _compute_spread(gradient, covariance)
+        errors[k] = error if error > PARTED * (np.abs(gradient) @ spread) else 0.0
     return errors
+
+
+def _compute_spread(gradient: ComplexArray, covariance: Array) -> float:
+    return math.sqrt(max(float((gradient.conj() @ covariance @ gradient).real), 0.0))
+
+
+def _differentiate_mean(roots: ComplexArray, alike: Any) -> ComplexArray:
+    r"""Return the derivatives of the mean of some roots that coincide by the coefficients.
+
+    .. math:: \frac{\partial}{\partial a_j} \sum_i z_i
+        = -\frac{1}{2 \pi i} \oint \frac{z^{n-j}}{A(z)} \, dz
+
+    around them alone, by the trapezoidal rule, which converges geometrically on a circle.
+    """
+    n, center = len(roots), roots[alike].mean()
+    far = np.abs(roots[~alike] - center)
+    radius = 0.5 * (float(far.min()) if far.size else max(abs(center), 1.0))
+    turn = np.exp(2j * np.pi * (np.arange(64) + 0.5) / 64)
+    z = center + radius * turn
+    value = np.prod(z[:, None] - roots, axis=1)
+    each = z[:, None] ** np.arange(n - 1, -1, -1) * (radius * turn / value)[:, None]
+    gradient: ComplexArray = -each.mean(axis=0) / np.count_nonzero(alike)
+    return gradient
 
 
 def _write_report(e: Estimate) -> str:
@@ -397,7 +437,9 @@ def _list_bad_news(e: Estimate) -> list[str]:
     ]
     news += merged
     # A merged pair at the edge is known to half the digits only.
-    unstable = np.abs(z) > 1 + 1e-9 if e.structure.domain == "z" else z.real > 0
+    twice = [np.sum(np.abs(z - one) <= RESOLVED * abs(one)) > 1 for one in z]
+    edge_of = np.where(twice, RESOLVED, 1e-9)
+    unstable = np.abs(z) > 1 + edge_of if e.structure.domain == "z" else z.real > 0
     if not unstable.any():
         edge = "outside the unit circle" if e.structure.domain == "z" else "in the right half plane"
         if any(bound.unstable for bound in e.active_bounds):

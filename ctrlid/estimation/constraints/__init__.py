@@ -99,7 +99,7 @@ def check_constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
 
 
 def divide_constraints(
-    constraints: Sequence[AbstractConstraint], outputs: Collection[str]
+    constraints: Sequence[AbstractConstraint], outputs: Collection[str], inputs: Collection[str]
 ) -> dict[str, tuple[AbstractConstraint, ...]]:
     """Return the constraints of each output: those that name it, and those that name none.
 
@@ -109,6 +109,8 @@ def divide_constraints(
         All of them.
     outputs : collection of str
         Names of the outputs.
+    inputs : collection of str
+        Names of the inputs.
 
     Returns
     -------
@@ -118,13 +120,14 @@ def divide_constraints(
     Raises
     ------
     CtrlidError
-        If one names an output that there is not.
+        If one names an output or an input that there is not.
     """
     for constraint in constraints:
-        name = getattr(constraint, "output", "")
-        if name not in ("", *outputs):
-            raise CtrlidError(f"{constraint!r} speaks of the output {name!r}; the record has "
-                              f"{', '.join(outputs)}.")  # fmt: skip
+        for kind, known in (("output", outputs), ("input", inputs)):
+            name = getattr(constraint, kind, "")
+            if name not in ("", *known):
+                raise CtrlidError(f"{constraint!r} speaks of the {kind} {name!r}; the record has "
+                                  f"{', '.join(known)}.")  # fmt: skip
     return {
         output: tuple(c for c in constraints if getattr(c, "output", "") in ("", output))
         for output in outputs

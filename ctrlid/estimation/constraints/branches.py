@@ -156,27 +156,29 @@ def _eliminate_cached(shape: tuple[int, int], numbers: bytes) -> Elimination:
     # One fit asks for the same few rows several times, and a study for them in every fit.
     work = np.frombuffer(numbers).reshape(shape).copy()
     m, p = shape[0], shape[1] - 1
-    weights = work[:, :p]
-    if m:
-        # Powers of two scale without rounding: rows of small integers stay exact.
-        size = np.maximum(np.abs(weights).max(axis=1), np.finfo(float).tiny)
-        work = np.ldexp(work, -np.frexp(size)[1][:, None])
+    work, columns = _equilibrate_rows(work)
+    # How large the terms are that each number is the sum of: what is left of them is rounding.
+    terms = np.abs(work)
     pivots: list[int] = []
     for step in range(min(m, p)):
-        rest = np.abs(work[step:, :p])
-        i, j = np.unravel_index(np.argmax(rest), rest.shape)
-        if rest[i, j] < 1e-11:
+        rest = np.where(np.abs(work[step:, :p]) > 1e-11 * terms[step:, :p], work[step:, :p], 0.0)
+        i, j = np.unravel_index(np.argmax(np.abs(rest)), rest.shape)
+        if rest[i, j] == 0:
             break
         chosen = step + int(i)
-        work[[step, chosen]] = work[[chosen, step]]
-        work[step] /= work[step, j]
+        work[[step, chosen]], terms[[step, chosen]] = work[[chosen, step]], terms[[chosen, step]]
+        pivot = work[step, j]
+        work[step], terms[step] = work[step] / pivot, terms[step] / abs(pivot)
         column = work[:, j].copy()
         column[step] = 0.0
         work -= np.outer(column, work[step])
+        terms += np.outer(np.abs(column), terms[step])
         pivots.append(int(j))
     rank = len(pivots)
-    if np.any(np.abs(work[rank:, p]) > 1e-9 * max(1.0, float(np.abs(work[:, p]).max(initial=0)))):
+    if np.any(np.abs(work[rank:, p]) > 1e-9 * terms[rank:, p]):
         raise Infeasible
+    # Back to the units of the coefficients.
+    work = np.ldexp(work, columns[pivots + [p] * (m - rank)][:, None] - columns)
     free = np.array([j for j in range(p) if j not in pivots], dtype=np.intp)
     offset, directions = np.zeros(p), np.zeros((p, len(free)))
     offset[pivots] = work[:rank, p]
@@ -189,6 +191,27 @@ def _eliminate_cached(shape: tuple[int, int], numbers: bytes) -> Elimination:
     for array in arrays:
         array.setflags(write=False)
     return Elimination(*arrays)
+
+
+def _equilibrate_rows(work: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Return rows whose largest weights are about one in every row and every column.
+
+    Coefficients may differ by many powers of ten in size, as those in s of a slow plant do. Powers
+    of two scale without rounding, so that rows of small integers stay exact. The exponents of the
+    columns are returned with them; that of the right-hand side is zero.
+    """
+    columns = np.zeros(work.shape[1], dtype=np.intp)
+    if not len(work):
+        return work, columns
+    for axis in (1, 0, 1, 0, 1):
+        size = np.abs(work[:, :-1]).max(axis=axis)
+        shift = np.where(size > 0, -np.frexp(size)[1], 0)
+        if axis:
+            work = np.ldexp(work, shift[:, None])
+        else:
+            columns[:-1] += shift
+            work = np.column_stack([np.ldexp(work[:, :-1], shift), work[:, -1]])
+    return work, columns
 
 
 def split_inequalities(rows: Rows) -> tuple[Array, Array, NDArray[np.intp], Array]:
@@ -206,9 +229,12 @@ def is_forced(rows: Rows, nonzero: Rows) -> bool:
     if not len(nonzero.lower):
         return False
     e = eliminate_equalities(rows.weights[rows.equality], rows.lower[rows.equality])
-    slack = np.abs(nonzero.weights @ e.directions).sum(axis=1)
+    # Small means small against the terms of the sum, which may be of any unit.
+    w = np.abs(nonzero.weights)
+    loose = np.abs(nonzero.weights @ e.directions) > 1e-9 * (w @ np.abs(e.directions))
     gap = np.abs(nonzero.weights @ e.offset - nonzero.lower)
-    return bool(np.any((slack < 1e-9) & (gap < 1e-9)))
+    apart = gap > 1e-9 * (w @ np.abs(e.offset) + np.abs(nonzero.lower))
+    return bool(np.any(~loose.any(axis=1) & ~apart))
 
 
 def is_feasible(rows: Rows, nonzero: Rows) -> bool:
@@ -223,13 +249,22 @@ def is_feasible(rows: Rows, nonzero: Rows) -> bool:
     if not len(h):
         return True
     reduced, room = g @ e.directions, h - g @ e.offset
-    norm = np.linalg.norm(reduced, axis=1)
-    empty = norm <= 1e-11 * np.linalg.norm(g, axis=1)
-    if np.any(room[empty] < -1e-9 * (1 + np.abs(h[empty]))):
+    terms = np.abs(g) @ np.abs(e.directions)
+    size = np.abs(h) + np.abs(g) @ np.abs(e.offset)
+    reduced = np.where(np.abs(reduced) > 1e-11 * terms, reduced, 0.0)
+    empty = ~reduced.any(axis=1)
+    if np.any(room[empty] < -1e-9 * size[empty]):
         return False
-    reduced, room = (reduced / norm[:, None])[~empty], (room / norm)[~empty]
+    reduced, room, size = reduced[~empty], room[~empty], size[~empty]
     if not len(room):
         return True
+    # Each free coefficient is counted in the largest value that a row asks of it.
+    asked = np.divide(
+        size[:, None], np.abs(reduced), out=np.zeros(reduced.shape), where=reduced != 0
+    ).max(axis=0)
+    reduced = reduced * np.where(asked > 0, asked, 1.0)
+    norm = np.linalg.norm(reduced, axis=1)
+    reduced, room = reduced / norm[:, None], room / norm
     # The largest common slack, at most 1: its sign decides, which a bare feasibility test with
     # the solver's own tolerance would blur.
     size = max(1.0, float(np.abs(room).max()))

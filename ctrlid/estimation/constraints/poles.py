@@ -78,7 +78,8 @@ class ReciprocalPoles(Known):
                 for v in (even, odd)
             ]
 
-        outwards = np.concatenate([[0.0], np.geomspace(1e-4, 4.0, 80)])
+        # Up to a factor of e^9 from sample to sample, beyond which no log shows a plant.
+        outwards = np.concatenate([[0.0], np.geomspace(1e-4, 9.0, 86)])
         positive = np.exp(outwards)
         label = "reciprocal pair at z"
         return (

@@ -179,7 +179,8 @@ def solve_program(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
     # Rows that the equalities already decide carry no direction of their own.
     size = np.linalg.norm(full, axis=1) / free.singular[-1]
     decided = norm <= 1e-11 * size
-    if np.any(room[decided] < -1e-9 * (1 + np.abs(h[decided]))):
+    terms = np.abs(h) + np.abs(g) @ np.abs(free.elimination.offset)
+    if np.any(room[decided] < -1e-9 * terms[decided]):
         raise Infeasible
     origin, on_bound = origin[~decided], (sign * h)[~decided]
     slope, room = slope[~decided] / norm[~decided, None], room[~decided] / norm[~decided]

@@ -121,14 +121,16 @@ def fit_arx(
     known = check_constraints(constraints)
     first, records = stream_records(record)
     structures = list_structures(na, nb, nk, first)
-    rows = divide_constraints(known, structures)
+    rows = divide_constraints(known, structures, first.signals["u"])
     if not is_several(first):
         (structure,) = structures.values()
+        # An iterator of records is read once: the first samples tell whether its errors are noise.
+        begun: list[Record] = []
+        if isinstance(record, Iterator):
+            records = _keep_first(records, begun)
         estimate = _fit_row(records, first, structure, known, intercept, jobs)
-        if not isinstance(record, Iterator):
-            # An iterator of records was read once, and is gone.
-            estimate = replace(estimate, notes=(*_note_errors(list(records), estimate),
-                                                *estimate.notes))  # fmt: skip
+        notes = _note_errors(begun or list(records), estimate)
+        estimate = replace(estimate, notes=(*notes, *estimate.notes))
         names = first.names
         return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
     if isinstance(record, Iterator):
@@ -192,6 +194,16 @@ def _fit_row(
         )
         estimate = replace(estimate, notes=(*estimate.notes, note))
     return estimate
+
+
+def _keep_first(records: Iterable[Record], begun: list[Record]) -> Iterator[Record]:
+    """Pass records on, and keep the first of them, as far as a test of their errors needs."""
+    left = ENOUGH
+    for record in records:
+        if left > 0:
+            begun.append(record[:left])
+            left -= len(record)
+        yield record
 
 
 def _note_motion(records: Iterable[Record], motions: list[float]) -> Iterator[Record]:

@@ -132,7 +132,7 @@ def fit_continuous(
     known = check_constraints(constraints)
     records = as_records(record)
     require_one_signal("fit_continuous", records)
-    divide_constraints(known, records[0].signals["y"])
+    divide_constraints(known, records[0].signals["y"], records[0].signals["u"])
     circuit = _make_circuit(controller, records)
     if circuit and zeros == poles:
         raise CtrlidError(
@@ -191,7 +191,8 @@ def fit_continuous(
         late += f", sensor noise a moving average of order {best.task.colour}"
     estimate = Estimate(
         structure=structure, values=found.theta, covariance=found.spread * rss / degrees,
-        intercepts=np.zeros(0), rss=rss, residual_variance=rss / degrees, n_samples=total,
+        intercepts=np.zeros(0), rss=rss, residual_variance=rss / degrees,
+        n_samples=sum(p.n for p in best.task.pieces),
         degrees_of_freedom=degrees, active_bounds=found.active_bounds, branch=found.branch,
         method=("constrained " if known else "") + "prediction error (continuous time)",
         solver=f"Gauss-Newton steps, {found.solver}{late}", dt=0.0, condition=found.condition,

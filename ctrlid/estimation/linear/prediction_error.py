@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,6 +43,10 @@ SLOWEST = 3
 # Directions of initial state and operating point below this share of the largest are not in the
 # data.
 RESOLVED = 1e-12
+# A delay is looked for up to this share of the longest stretch.
+LONGEST_DELAY = 10
+# No stretch loses more than this share of its samples to a delay.
+SHORTENED = 4
 
 
 class NotDetermined(CtrlidError):
@@ -55,6 +59,12 @@ class Piece:
 
     signals: dict[str, Array]
     n: int
+    # The input before its first sample, as far as it is known.
+    before: Array = field(default_factory=lambda: np.zeros(0))
+
+    def predict(self, motion: DiscreteModel, gain: Array) -> Array | None:
+        """Return the prediction errors of a model; None if its observer is unstable."""
+        return compute_prediction_errors(motion, gain, self.signals, self.before)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +137,7 @@ class Task:
 def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
     """Return the prediction errors and what initial state and operating point add to them."""
     motion = task.discretize(point.theta, point.delay)
-    errors = compute_prediction_errors(motion, point.gain, piece.signals)
+    errors = piece.predict(motion, point.gain)
     if errors is None:
         return None
     size, n = len(motion.f), piece.n
@@ -143,10 +153,26 @@ def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
             more = min(filled, n - filled)
             free[filled : filled + more] = free[:more] @ power
             power, filled = power @ power, filled + more
-    ones = {name: np.zeros(n) for name in piece.signals} | list_inputs(np.ones(n), task.hold)
+    ones = {name: np.zeros(n) for name in piece.signals}
+    ones |= {"y": np.ones(n)} if _has_no_gain(task, point) else list_inputs(np.ones(n), task.hold)
     rest = compute_prediction_errors(motion, point.gain, ones)
     assert rest is not None  # The observer is the one that was stable above.
     return np.column_stack([free, rest, errors])
+
+
+def _has_no_gain(task: Task, point: Point) -> bool:
+    """Whether a level of y, and not of u, is what an unknown operating point adds.
+
+    Beside a free initial state one follows from the other, but for a plant that passes no constant
+    on: an offset of u then does what a state does, and a level of y, as of a sensor whose zero is
+    off, is the offset that is left. A plant with a pole at the origin has it the other way round,
+    and a known circuit sees y as well.
+    """
+    if task.circuit is not None:
+        return False
+    num, den = task.structure.fraction(point.theta)
+    num, den = (np.abs(p) * task.speed ** np.arange(len(p)) for p in (num[::-1], den[::-1]))
+    return bool(num[0] * den.max() < den[0] * num.max())
 
 
 def _compute_residuals(task: Task, point: Point) -> list[Array]:
@@ -179,7 +205,7 @@ def _compute_errors(task: Task, point: Point, piece: Piece) -> Array | None:
     if point.delay < 0:
         return None
     motion = task.discretize(point.theta, point.delay)
-    return compute_prediction_errors(motion, point.gain, piece.signals)
+    return piece.predict(motion, point.gain)
 
 
 def _differentiate_errors(
@@ -371,6 +397,10 @@ def find_best_fit(task: Task, known: Sequence[AbstractConstraint], delay: float)
     NotDetermined
         If some coefficients change no prediction.
     """
+    whole, latest = task, delay
+    if task.free_delay:
+        latest = max(p.n for p in task.pieces) * task.dt / LONGEST_DELAY
+    task = _give_lead(task, latest)
     starts = _rank_starts(task, delay)
     short = replace(task, pieces=_take_head(task.pieces))
     ranked: list[tuple[float, float, Point]] = []
@@ -390,7 +420,9 @@ def find_best_fit(task: Task, known: Sequence[AbstractConstraint], delay: float)
     ranked.sort(key=lambda r: r[0])
     _, speed, point = ranked[0]
     try:
-        task = _change_speed(task, speed)
+        # The delay is about known now, and may move by a sample or two.
+        lead = point.delay + 2 * task.dt if task.free_delay else delay
+        task = _change_speed(_give_lead(whole, lead), speed)
         best, found, rss, settled = _minimize_twice(task, point, known)
     except NotExcited as trouble:
         raise NotDetermined(
@@ -527,9 +559,25 @@ def _take_head(pieces: tuple[Piece, ...], samples: int = 8000) -> tuple[Piece, .
         take = min(piece.n, samples - total)
         if take < 40 and head:
             break
-        head.append(Piece({k: s[:take] for k, s in piece.signals.items()}, take))
+        signals = {k: s[:take] for k, s in piece.signals.items()}
+        head.append(Piece(signals, take, piece.before))
         total += take
     return tuple(head)
+
+
+def _give_lead(task: Task, delay: float) -> Task:
+    """Return the task with stretches that begin only where the input that acts is in the record.
+
+    What u was before a stretch nobody knows. Where it was not what it is at its first sample, a
+    simulated delay would have the wrong input for so long.
+    """
+    samples = math.ceil(delay / task.dt - 1e-9)
+    pieces = []
+    for piece in task.pieces:
+        lead = min(samples, piece.n // SHORTENED)
+        signals = {name: s[lead:] for name, s in piece.signals.items()}
+        pieces.append(Piece(signals, piece.n - lead, piece.signals["u"][:lead]))
+    return replace(task, pieces=tuple(pieces))
 
 
 def _rank_starts(task: Task, delay: float) -> list[tuple[float, Point]]:
@@ -547,14 +595,36 @@ def _rank_starts(task: Task, delay: float) -> list[tuple[float, Point]]:
     combinations = [
         (*slow, *fast) for slow in itertools.combinations_with_replacement(levels, min(s.na, 2))
     ]
-    ranked = []
-    for roots in combinations:
-        speed = max(float(np.exp(np.mean(np.log(np.maximum(np.abs(roots), rates[0]))))), rates[0])
-        point, rss = _fit_numerator(_change_speed(task, speed), pieces, np.array(roots), delay)
-        if point is not None:
-            ranked.append((rss, speed, point))
-    ranked.sort(key=lambda r: r[0])
-    return [(speed, point) for _, speed, point in ranked]
+
+    def rank(tried: Sequence[tuple[float, ...]], delay: float) -> list[_Start]:
+        found = []
+        for roots in tried:
+            magnitudes = np.maximum(np.abs(roots), rates[0])
+            speed = max(float(np.exp(np.mean(np.log(magnitudes)))), rates[0])
+            point, rss = _fit_numerator(_change_speed(task, speed), pieces, np.array(roots), delay)
+            if point is not None:
+                found.append(_Start(rss, speed, point, roots))
+        return sorted(found, key=lambda start: start.rss)
+
+    ranked = rank(combinations, delay)
+    if not task.free_delay:
+        return [(start.speed, start.point) for start in ranked]
+    # Steps of Gauss and Newton do not find a delay that is several times as long as u stays alike.
+    likely = [start.roots for start in ranked[:6]]
+    late = task.dt * 2.0 ** np.arange(np.log2(max(length / task.dt / LONGEST_DELAY, 1.0)))
+    delayed = sorted((s for d in late for s in rank(likely, d)), key=lambda start: start.rss)
+    # Those without a delay and those with one come in turn, the better ones first.
+    mixed = [s for pair in itertools.zip_longest(ranked, delayed) for s in pair if s is not None]
+    return [(start.speed, start.point) for start in mixed]
+
+
+class _Start(NamedTuple):
+    """Where a search may begin: the squared errors there, a typical rate, and the poles."""
+
+    rss: float
+    speed: float
+    point: Point
+    roots: tuple[float, ...]
 
 
 def _fit_numerator(
@@ -579,7 +649,7 @@ def _fit_numerator(
         slopes = []
         for i in range(s.nb):
             theta = blank.theta + _make_unit_vector(len(s.names), s.na + i)
-            errors = compute_prediction_errors(task.discretize(theta, delay), gain, piece.signals)
+            errors = piece.predict(task.discretize(theta, delay), gain)
             if errors is None:
                 return None, np.inf
             slopes.append(errors - table[:, -1])

@@ -103,12 +103,24 @@ def _exponential(matrix: Array) -> Array:
     return total if np.isfinite(total).all() else np.full(matrix.shape, np.nan)
 
 
+def _find_unit(a: Array, b: Array) -> float:
+    """Return the power of two that makes what drives the states as large as what they do alone.
+
+    The motion is linear in b. Beside a b of another size, the exponential of both would lose the
+    digits of a: where y is counted in units a billion times smaller than those of u, all but seven.
+    """
+    size, alone = float(np.abs(b).max(initial=0.0)), float(np.abs(a).max(initial=0.0))
+    if not (np.isfinite(size) and np.isfinite(alone) and size > 0 and alone > 0):
+        return 1.0
+    return float(2.0 ** np.clip(np.round(np.log2(size / alone)), -1000, 1000))
+
+
 def _integrate_hold(a: Array, b: Array, time: float) -> tuple[Array, Array]:
-    n = len(a)
+    n, unit = len(a), _find_unit(a, b)
     block = np.zeros((n + 1, n + 1))
-    block[:n, :n], block[:n, n] = a * time, b * time
+    block[:n, :n], block[:n, n] = a * time, b / unit * time
     e = _exponential(block)
-    return e[:n, :n], e[:n, n]
+    return e[:n, :n], unit * e[:n, n]
 
 
 def discretize_model(
@@ -149,12 +161,12 @@ def discretize_model(
         corners = [(name_corner(k), 0, columns[k]) for k in range(PIECES)]
         return DiscreteModel(powers[PIECES], (*corners, (name_corner(0), -1, columns[-1])), c, n)
     if hold == "foh":
+        unit = _find_unit(a, b)
         block = np.zeros((n + 2, n + 2))
-        block[:n, :n], block[:n, n], block[n, n + 1] = a * dt, b * dt, 1.0
+        block[:n, :n], block[:n, n], block[n, n + 1] = a * dt, b / unit * dt, 1.0
         e = _exponential(block)
-        return DiscreteModel(
-            e[:n, :n], (("u", 0, e[:n, n] - e[:n, n + 1]), ("u", -1, e[:n, n + 1])), c, n
-        )
+        held, ramp = unit * e[:n, n], unit * e[:n, n + 1]
+        return DiscreteModel(e[:n, :n], (("u", 0, held - ramp), ("u", -1, ramp)), c, n)
     whole, part = divmod(delay / dt, 1.0)
     late = int(whole)
     f, gamma = _integrate_hold(a, b, dt)
@@ -196,7 +208,12 @@ def _discretize_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit
     block[v, :] = k.c @ block[q, :]
     block[v, :] -= k.d * (c @ block[x, :])
     block[v, size + 1] = k.d / dt
+    # The input is counted in units in which it drives the plant as much as the plant itself does.
+    unit = _find_unit(a, b)
+    block[v, :] *= unit
+    block[:, v] /= unit
     motion = _exponential(block * dt)[: n + m]
+    motion[:, v] *= unit
     f = motion[:, : n + m].copy()
     # e = r - (y_measured - c x): the estimate of the noise at the sample.
     both = np.concatenate([c, np.zeros(m)])
@@ -238,7 +255,7 @@ def place_gain(motion: DiscreteModel, gain: Array) -> Array:
 
 
 def compute_prediction_errors(
-    motion: DiscreteModel, gain: Array, signals: dict[str, Array]
+    motion: DiscreteModel, gain: Array, signals: dict[str, Array], before: Array | None = None
 ) -> Array | None:
     r"""Return the prediction errors of the model with an observer gain.
 
@@ -253,6 +270,8 @@ def compute_prediction_errors(
         Observer gain K of the plant's states, then of those of the noise.
     signals : dict
         Arrays of the signals by name; all of the same length, deviations from a constant.
+    before : ndarray, optional
+        The input before the first sample; what is not known of it is as at that sample.
 
     Returns
     -------
@@ -267,8 +286,9 @@ def compute_prediction_errors(
     late, at_once = motion.direct
     seen = signals["y"]
     if at_once:
-        seen = seen - at_once * _delay_signal(signals["u"], late)
-    driving = np.array([_delay_signal(signals[name], shift) for name, shift, _ in motion.inputs])
+        seen = seen - at_once * _delay_signal(signals["u"], late, before)
+    driving = np.array([_delay_signal(signals[name], shift, before if name == "u" else None)
+                        for name, shift, _ in motion.inputs])  # fmt: skip
     columns = np.column_stack([column for *_, column in motion.inputs])
     errors: Array = _run_observer(closed, columns, k, motion.c, driving, seen)
     return errors
@@ -299,8 +319,10 @@ def _run_observer(
     return errors
 
 
-def _delay_signal(s: Array, samples: int) -> Array:
+def _delay_signal(s: Array, samples: int, before: Array | None = None) -> Array:
     """Shift a signal later by some samples, or earlier by one; its ends are held."""
+    if before is not None and len(before) and samples > 0:
+        return _delay_signal(np.concatenate([before, s]), samples)[len(before) :]
     if samples == 0:
         return s
     samples = min(samples, len(s))
