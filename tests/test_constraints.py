@@ -342,8 +342,10 @@ def test_right_facts_do_not_contradict_each_other_in_any_unit(scale):
 def test_known_poles_of_fast_and_slow_plants_are_taken(dt, rates):
     rng = np.random.default_rng(3)
     u = np.repeat(rng.choice([-1.0, 1.0], 160), 5)
-    plant = ct.tf([3 * np.prod(rates)], np.poly([-p for p in rates]))
-    y = ct.forced_response(ct.sample_system(ct.ss(plant), dt), np.arange(800) * dt, u).outputs
+    # A chain of lags with a gain of three.
+    lags = np.diag([-p for p in rates]) + np.diag(rates[1:], -1)
+    plant = ct.ss(lags, [[rates[0]], [0], [0]], [[0, 0, 3]], 0)
+    y = ct.forced_response(ct.sample_system(plant, dt), np.arange(800) * dt, u).outputs
     record = cid.Record(u=u, y=y + 1e-3 * rng.standard_normal(800), dt=dt)
     known = [cid.StaticGain(3.0), *(cid.PoleAt(-p) for p in rates)]
     fitted = cid.fit_continuous(record, 3, constraints=known).estimate
@@ -375,7 +377,7 @@ def test_poles_that_a_constraint_merges_have_no_invented_errors():
 def test_a_double_pole_on_a_bound_has_the_error_of_its_mean():
     """It is at -a1/2, so that its error is half of that of a1."""
     record = respond(1.0, 200)
-    real = cid.Nonlinear(inequality=lambda theta: [theta[1] - theta[0] ** 2 / 4])
+    real = cid.Nonlinear(inequality=lambda theta: [theta[0] ** 2 / 4 - theta[1]])
     found = cid.fit_arx(record, 2, 2, constraints=[real]).estimate
     assert abs(found.poles[0] - found.poles[1]) < 1e-6
     half = found.standard_errors[0] / 2
