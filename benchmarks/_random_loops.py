@@ -18,6 +18,7 @@ from scipy.signal import lfilter
 
 import ctrlid as cid
 from ctrlid import effects
+from ctrlid.loop.period_map import count_forces
 from ctrlid.loop.simulation import Simulator
 
 SAMPLES = 20_000
@@ -34,14 +35,15 @@ class Noise:
     coloured: float = 0.0
     time: float = 1.0
 
-    def draw(self, rng: np.random.Generator, n: int) -> list[np.ndarray]:
-        """Return sensor noise and force, each of n samples."""
+    def draw(self, rng: np.random.Generator, n: int, forces: int = 1) -> list[np.ndarray]:
+        """Return sensor noise and forces, each of n samples; forces after the first are white."""
         white = rng.standard_normal((3, n))
         memory = math.exp(-1 / self.time)
         steps = white[2] * math.sqrt(1 - memory**2)
         steps[0] = white[2, 0]
         colour = lfilter([1.0], [1.0, -memory], steps)
-        return [self.sensor * white[0], self.force * white[1] + self.coloured * colour]
+        more = self.force * rng.standard_normal((forces - 1, n))
+        return [self.sensor * white[0], self.force * white[1] + self.coloured * colour, *more]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,8 @@ class Draw:
         given = self.excitation(seed) if r is None else np.asarray(r, dtype=float)
         n, closed = len(given), real.controller is not None
         simulator = Simulator(real, FINE, MOST)
-        hiss = (noise or self.noise).draw(np.random.default_rng([seed, 7]), n)
+        rng, forces = np.random.default_rng([seed, 7]), count_forces(real.equations())
+        hiss = (noise or self.noise).draw(rng, n, forces)
         if spread is not None:
             hiss[0] = hiss[0] * spread
         r, d = (given, np.zeros(n)) if closed else (None, given)
@@ -413,6 +416,9 @@ def hidden(
         return _limits(rng, kind, s.y, s.rest[1])
     if kind is E.StateLimit:
         return _full(rng, one, s)
+    if kind not in simple:
+        raise KeyError(f"{kind.__name__} has no size: give it a row in `hidden` of {__name__}.py, "
+                       "with z the size relative to what is easily seen")  # fmt: skip
     return simple[kind]
 
 

@@ -27,6 +27,7 @@ those of the tests.
 from __future__ import annotations
 
 import argparse
+import difflib
 import itertools
 import json
 import math
@@ -64,6 +65,8 @@ from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.thresholds import THRESHOLD, vary_numbers
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
+# Numbers that may be varied: a run with another value is another run.
+NUMBERS = {t.name for t in THRESHOLD.table()}
 KINDS = ("named", "none", "outside", "two", "three", "lookalike", "inside")
 WORTH = {"faint": (50.0, 300.0), "moderate": (300.0, 3e3), "ordinary": (3e3, 3e4)}
 TRIES = 40  # draws until one can carry an effect of the wanted worth
@@ -936,7 +939,8 @@ def read(paths: Iterable[str]) -> list[Row]:
         row = Row(**json.loads(line))
         row.truth, row.equal = tuple(row.truth), tuple(row.equal)
         row.named = tuple(tuple(s) for s in row.named)
-        rows[row.kind, row.worth_class, row.seed, row.index] = row
+        varied = tuple((k, v) for k, v in sorted(row.extra.items()) if k in NUMBERS)
+        rows[row.kind, row.worth_class, row.seed, row.index, varied] = row
     return list(rows.values())
 
 
@@ -948,9 +952,13 @@ def parse_vary(text: str) -> list[dict[str, float]]:
     """
     name, _, values = text.partition("=")
     known = {t.name: t.value for t in THRESHOLD.table()}
-    if name not in known or isinstance(known[name], tuple):
+    if isinstance(known.get(name), tuple):
+        raise argparse.ArgumentTypeError(f"{name} is several numbers, which cannot be varied")
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 3)
         raise argparse.ArgumentTypeError(
-            f"needs a number of ctrlid/diagnosis/thresholds.py; given {name!r}"
+            f"needs a number of ctrlid/diagnosis/thresholds.py; given {name!r}. Alike are "
+            f"{', '.join(near) or 'none'}"
         )
     kind = type(known[name])
     try:
@@ -976,6 +984,8 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--limit", type=int, default=0, help="seconds for a diagnosis; 0: none")
     parser.add_argument("--only", nargs="+", type=int, help="numbers of runs")
+    parser.add_argument("--effect", choices=[c.__name__ for c in CATALOGUE],
+                        help="hide this one only, with --kind named")  # fmt: skip
     parser.add_argument("--unknown", action="store_true", help="diagnose without the controller")
     parser.add_argument("--vary", type=parse_vary, metavar="NUMBER=V1,V2", default=[{}],
                         help="diagnose with other values of a number that decides")  # fmt: skip
@@ -991,7 +1001,12 @@ def main() -> None:
     classes: Sequence[Any] = CATALOGUE
     if options.kind == "lookalike":
         classes = [getattr(effects, name) for name in CONFUSED]
+    if options.effect:
+        if options.kind != "named":
+            parser.error("--effect goes with --kind named")
+        classes = [getattr(effects, options.effect)]
     work = joblib.Parallel(n_jobs=options.jobs, return_as="generator")
+    answers: dict[tuple[int, str], list[str]] = {}
     for setting in options.vary:
         if setting:
             print(f"\n{', '.join(f'{name} = {v:g}' for name, v in setting.items())}")
@@ -1003,6 +1018,9 @@ def main() -> None:
         ):  # fmt: skip
             row.extra |= setting
             rows.append(row)
+            named = "; ".join(" or ".join(names) for names in row.named)
+            answer = f"{row.verdict}: {named or 'no name'}"
+            answers.setdefault((row.index, " + ".join(row.truth)), []).append(answer)
             print(row.text() if not row.extra.get("skipped") else
                   f"{row.index:4d} {row.kind} {', '.join(row.truth)}: no draw carries it",
                   flush=True)  # fmt: skip
@@ -1010,6 +1028,11 @@ def main() -> None:
                 with Path(options.out).open("a") as file:
                     file.write(json.dumps(vars(row)) + "\n")
         report(rows)
+    if len(options.vary) > 1:
+        changed = {k: told for k, told in answers.items() if len(set(told)) > 1}
+        print(f"\n{len(changed)} of {len(answers)} draws have another answer")
+        for (index, truth), told in changed.items():
+            print(f"{index:4d} {truth} -> {' | '.join(told)}")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from ctrlid.diagnosis.thresholds import THRESHOLD
 from problems import load_script
 
 study = load_script("benchmarks", "study_diagnosis")
+loops = load_script("benchmarks", "_random_loops")
 
 SEED = 90_210  # none of the study
 
@@ -122,7 +123,7 @@ def test_numbers_of_the_table_are_varied_on_the_same_draws(monkeypatch):
         {"near_winner": 0.5}, {"near_winner": 0.3}, {"near_winner": 0.9}]  # fmt: skip
     assert study.parse_vary("looked_at=3") == [{"looked_at": 5}, {"looked_at": 3}]
     for wrong in ("nonsense=1", "gate=much", "experiment_levels=1", "gate"):
-        with pytest.raises(argparse.ArgumentTypeError, match="needs"):
+        with pytest.raises(argparse.ArgumentTypeError, match=r"needs|several"):
             study.parse_vary(wrong)
     seen = []
 
@@ -147,3 +148,20 @@ def test_rows_survive_their_file(tmp_path):
     assert again.named == row.named
     assert again.truth == row.truth
     assert again.text() == row.text()
+
+
+@pytest.mark.parametrize("plant", sorted(loops.PLANTS))
+def test_every_plant_is_drawn_and_shaken(plant):
+    """Two tanks have a random force each, and the study ended with an error of shapes."""
+    one = loops.draw(np.random.default_rng(1), plant, False, 400)
+    record = one.run(one.loop, 1)
+    assert np.isfinite(record.y).all()
+    assert np.ptp(record.y) > 0
+
+
+def test_every_effect_of_the_catalogue_has_a_size_to_be_hidden_with():
+    for kind in effects.CATALOGUE:
+        plant = next(p for p in loops.PLANTS if p in study.plants_for(kind))
+        one = loops.draw(np.random.default_rng(3), plant, False, 400)
+        made = loops.hidden(np.random.default_rng(4), kind, one, loops.scales_of(one, 1))
+        assert made is None or isinstance(made(1.0), kind)

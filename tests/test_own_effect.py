@@ -223,3 +223,56 @@ def test_an_effect_that_is_not_finished_says_what_it_lacks():
         cid.simulate(drive().with_effect(Formless(1.0)), np.zeros(9))
     with pytest.raises(cid.CtrlidError, match=r"declares size, .* write @dataclass\(frozen=True\)"):
         Undecorated(size=1.0)
+
+
+@dataclass(frozen=True)
+class Pull(E.ForceEffect):
+    """A magnet at a place that has a default, which no fit has to guess."""
+
+    strength: float = E.parameter("{y}^3/s^2", neutral=0.0)
+    site: float = E.parameter("{y}", default=2.0)
+
+    def force(self, m):
+        return self.strength / (self.site - m.position) ** 2
+
+
+@dataclass(frozen=True)
+class Lost(E.ForceEffect):
+    """One whose place nobody says."""
+
+    strength: float = E.parameter("{y}^3/s^2", neutral=0.0)
+    site: float = E.parameter("{y}")
+
+    def force(self, m):
+        return self.strength / (self.site - m.position) ** 2
+
+
+def test_a_parameter_without_a_neutral_value_starts_from_its_default():
+    """The effect of the manual was never tried, without a word."""
+    assert Pull.candidates(drive()) == (Pull(0.0, 2.0),)
+    with pytest.raises(cid.CtrlidError, match=r"Lost would never be tried: nothing says .* site"):
+        cid.diagnose(drive(), record_of(Brake(1.0)), catalogue=[Lost], progress=False)
+
+
+@dataclass(frozen=True)
+class Wild(E.ForceEffect):
+    """A state that no sampling follows."""
+
+    size: float = E.parameter("{y}/s^2", neutral=0.0)
+    states = ("z",)
+
+    def rates(self, m):
+        return ((m.velocity - m.own["z"]) * 4e9,)
+
+    def force(self, m):
+        return self.size * m.own["z"]
+
+
+def test_an_effect_that_cannot_be_tried_is_told():
+    found = cid.diagnose(drive(), record_of(Brake(1.0)), catalogue=[Wild], progress=False)
+    assert [note for note in found.notes if note.startswith("Wild could not be tried: ")]
+
+
+def test_a_unit_has_names_that_mean_something():
+    with pytest.raises(cid.CtrlidError, match=r"unit takes \{u\}, \{y\} and \{x\}.* given \{z\}"):
+        E.parameter("1/{z}")

@@ -119,7 +119,7 @@ def assemble_answer(
         objection = blame_slow_force(disturbance, gap.force_unit)
     complete = found.after.passed and not left and objection is None
     verdict = choose_verdict(complete, named=bool(findings))
-    notes = (*fitted.estimate.notes, *_list_notes(loop, found))
+    notes = (*fitted.estimate.notes, *_list_notes(loop, found), *_list_untried(found))
     calibrated = _list_calibrated(loop, found, fitted.loop, errors)
     tests = dict(found.after.p_values)
     ranking = _rank_candidates(found)
@@ -280,6 +280,16 @@ def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> list
         if refit_candidate(alone, screen_at(alone, f.trial.fitted)).net_gain > THRESHOLD.gate:
             seen.append(k)
     return seen
+
+
+def _list_untried(found: Search) -> list[str]:
+    """Say of effects of the user's own that could not be tried, and why not."""
+    said: dict[str, str] = {}
+    for t in (t for step in found.steps for t in step.trials):
+        own = not type(t.effect).__module__.startswith("ctrlid.")
+        if own and t.out is not None and t.out.ground == "cannot run":
+            said.setdefault(t.effect.called, t.out.words)
+    return [f"{name} could not be tried: {words}" for name, words in said.items()]
 
 
 def _rank_candidates(found: Search) -> tuple[Candidate, ...]:

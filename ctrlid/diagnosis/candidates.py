@@ -10,6 +10,7 @@ import numpy as np
 
 from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
+from .._base.text import write_list
 from ..data.record import Record, hold_readings
 from ..data.validity import find_last_valid
 from ..effects import AbstractEffect
@@ -206,6 +207,14 @@ def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:
         if not (isinstance(kind, type) and issubclass(kind, AbstractEffect)):
             raise CtrlidError("catalogue= is a list of classes of effects, such as "
                               f"ctrlid.effects.CATALOGUE; given {kind!r}")  # fmt: skip
+        own = kind.__mro__[: kind.__mro__.index(AbstractEffect)]
+        proposes = any("candidates" in vars(base) for base in own)
+        undecided = [] if proposes else kind.list_undecided()
+        if undecided:
+            raise CtrlidError(f"the effect {kind.__name__} would never be tried: nothing says from "
+                              f"which value of {write_list(undecided)} a fit starts. Give a "
+                              "neutral value or a default, or write the class method "
+                              "candidates(cls, loop, record)")  # fmt: skip
     if kinds is not catalogue:
         raise CtrlidError("catalogue= is a list of classes of effects; put the one given into "
                           f"brackets: [{catalogue!r}]")  # fmt: skip

@@ -311,6 +311,8 @@ class AbstractEffect(metaclass=CheckedCalls):
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return instances to start a fit from: neutral, where the derivative there is of use.
 
+        A parameter that has no neutral value starts from its default.
+
         Parameters
         ----------
         loop : Loop
@@ -323,12 +325,21 @@ class AbstractEffect(metaclass=CheckedCalls):
         tuple of effects
             Empty where the effect makes no sense for the plant.
         """
-        neutral = {p.name: p.neutral for p in cls.parameters()}
-        structure = [f for f in dataclasses.fields(cls)
-                     if "parameter" not in f.metadata and f.name != "at"]  # fmt: skip
-        if structure or any(v is None for v in neutral.values()):
+        if cls.list_undecided():
             return ()
+        neutral = {p.name: p.neutral for p in cls.parameters() if p.neutral is not None}
         return cls._applicable(loop, cls(**neutral))
+
+    @classmethod
+    def list_undecided(cls) -> list[str]:
+        """Return the fields that keep `candidates` from proposing anything.
+
+        They have neither a neutral value nor a default, or say what the effect acts on.
+        """
+        fields = [f for f in dataclasses.fields(cls) if f.name != "at"]
+        neutral = {p.name: p.neutral for p in cls.parameters()}
+        return [f.name for f in fields if f.name not in neutral
+                or (neutral[f.name] is None and f.default is dataclasses.MISSING)]  # fmt: skip
 
     @classmethod
     def _applicable(cls, loop: Any, *effects: Any) -> tuple[Any, ...]:

@@ -2,12 +2,17 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from .._base import units as _units
 from .._base.arguments import check_arguments
+from .._base.errors import CtrlidError
+
+# What the names in the unit of a parameter stand for.
+WORDS = {"u": "input unit", "y": "output unit", "x": "unit of the state"}
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,8 @@ def parameter(
     Parameters
     ----------
     unit : str
-        Unit, with ``{u}`` and ``{y}`` for the units of input and output; "" for a plain number.
+        Unit, with ``{u}`` and ``{y}`` for the units of input and output, and ``{x}`` for that of
+        the state that the effect names; "" for a plain number.
     lower, upper : float, optional
         Physical bounds, included.
     neutral : float, optional
@@ -68,8 +74,17 @@ def parameter(
     -------
     dataclasses.Field
         The field.
+
+    Raises
+    ------
+    CtrlidError
+        If the unit has other names in braces.
     """
     check_arguments(parameter, locals(), "default")
+    unknown = [name for name in re.findall(r"\{(.*?)\}", unit) if name not in WORDS]
+    if unknown:
+        raise CtrlidError(f"unit takes {{u}}, {{y}} and {{x}} for the units of input, output and "
+                          f"state; given {{{unknown[0]}}} in {unit!r}")  # fmt: skip
     about = {"unit": unit, "lower": lower, "upper": upper, "neutral": neutral,
              "instant": instant, "searched": searched, "optional": optional}  # fmt: skip
     default = 0.0 if optional else default
@@ -92,5 +107,4 @@ def write_unit(unit: str) -> str:
     >>> write_unit("s"), write_unit("{y}/s"), write_unit("1/(s {u}^2)"), write_unit("")
     (' [s]', ' [output unit/s]', ' [1/(s (input unit)^2)]', '')
     """
-    words = {"u": "input unit", "y": "output unit", "x": "unit of the state"}
-    return f" [{fill_unit(unit, words)}]" if unit else ""
+    return f" [{fill_unit(unit, WORDS)}]" if unit else ""
