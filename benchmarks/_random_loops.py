@@ -367,6 +367,7 @@ def hidden(
     top = float(np.abs(s.u).max()) or 1.0
     drag = s.push / s.speed
     name = str(rng.choice(one.loop.free))
+    held = [k for k in one.loop.parameters if k not in one.loop.free and "." not in k]
     when = rng.uniform(0.2, 0.8) * s.duration
     wave = log_uniform(rng, 5 / s.duration, 0.1 / s.dt)
     ripple = rng.uniform(0.05, 0.5) * float(np.ptp(s.y))
@@ -378,6 +379,7 @@ def hidden(
         E.InputDeadZone: lambda z: E.InputDeadZone(0.2 * z * s.swing),
         E.InputOffset: lambda z: E.InputOffset(0.1 * sign * z * s.swing),
         E.InputBacklash: lambda z: E.InputBacklash(0.2 * z * s.swing),
+        E.InputRateLimit: lambda z: E.InputRateLimit(2 * s.swing / (s.dt * z)),
         E.InputNonlinearity: lambda z: E.InputNonlinearity(0.05 * sign * z / s.swing),
         E.InputSaturatingGain: lambda z: E.InputSaturatingGain(0.05 * z / top**2),
         E.ViscousFriction: lambda z: E.ViscousFriction(0.05 * z * drag),
@@ -407,6 +409,11 @@ def hidden(
         E.ParameterStep: lambda z: E.ParameterStep(name, when, 0.02 * sign * z),
         E.SensorLag: lambda z: E.SensorLag(0.3 * z * s.dt),
         E.SensorNonlinearity: lambda z: E.SensorNonlinearity(0.05 * sign * z / s.reach),
+        # What is fitted anyway can be hidden by no error of it.
+        E.ParameterError: lambda z: E.ParameterError((held or [name])[0], 0.02 * sign * z),
+        E.SensorGain: lambda z: E.SensorGain(0.02 * sign * z),
+        E.SensorDrift: lambda z: E.SensorDrift(0.3 * sign * z * s.reach / s.duration),
+        E.SensorHum: lambda z: E.SensorHum(0.2 * z * s.sensor, wave, phase),
         E.SensorOffset: lambda z: E.SensorOffset(0.2 * sign * z * s.reach),
         E.Quantization: lambda z: E.Quantization(2 * z * s.sensor),
     }
