@@ -304,7 +304,8 @@ def test_an_effect_of_ones_own():
     pull = MagneticPull(strength=0.05)
     assert str(pull) == "MagneticPull: strength = 0.05 [y]^3/s^2, gap = 0.5 [y]"
     assert pull.units(loop) == {"strength": "m^3/s^2", "gap": "m"}
-    assert MagneticPull.candidates(loop) == ()  # the gap has no neutral value to start from
+    # The gap has no neutral value, and starts from its default.
+    assert MagneticPull.candidates(loop) == (MagneticPull(strength=0.0, gap=0.5),)
     attracted = loop.with_effect(pull)
     e, x = attracted.equations(), np.array([0.3, 0.2])
     assert e.evaluate(x, 1.0)[0][1] == pytest.approx((4.0 * 1.0 - 3.0 * 0.2) / 2 + 0.05 / 0.64)

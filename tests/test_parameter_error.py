@@ -115,7 +115,7 @@ def test_a_report_says_the_right_value_in_place_of_the_given_one(found):
     ],
 )
 def test_a_value_and_the_one_it_replaces_have_the_same_digits(given, unit, error, spread, words):
-    loop = SimpleNamespace(parameters={"ER": given}, units={"ER": unit})
+    loop = SimpleNamespace(parameters={"ER": given}, known_units={"ER": unit})
     effect = E.ParameterError("ER", error=error / given)
     errors = None if spread is None else {"error": spread / given}
     assert describe_parameters(SimpleNamespace(loop=loop), effect, errors) == words

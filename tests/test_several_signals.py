@@ -160,8 +160,9 @@ def test_refused_records(fields, words):
 
 def test_picture_has_axes_for_every_signal():
     axes = cid.plot.record(make())
-    assert [ax.get_ylabel() for ax in axes] == ["theta [rad]", "alpha [deg]", "V [V]"]
-    assert "reference alpha" in axes[1].get_legend_handles_labels()[1]
+    assert [ax.get_ylabel() for ax in axes] == [
+        "theta [rad]", "alpha [deg]", "alpha [rad]", "V [V]"]  # fmt: skip
+    assert "reference alpha" in axes[2].get_legend_handles_labels()[1]
 
 
 def test_page_lists_every_signal(tmp_path):
