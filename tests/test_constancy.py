@@ -2,6 +2,7 @@
 
 import control as ct
 import numpy as np
+import pytest
 
 import ctrlid as cid
 import problems
@@ -78,6 +79,7 @@ def test_a_force_law_that_is_only_nearly_right_shows_in_its_parameter():
     assert seen_in(named, record)["constancy of LinearStiffness.k1 over position"] < 1e-12
 
 
+@pytest.mark.slow
 def test_a_diagnosis_is_not_clean_where_a_gain_breathes():
     record = record_of(breathing(rhythm=0.03), 9740, n=2000)
     found = cid.diagnose(breathing(), record, progress=False,

@@ -205,6 +205,7 @@ def test_friction_is_named_at_its_place_beside_wild_readings():
     assert list_wild_shares(found)[0] == 0 < list_wild_shares(found)[1]
 
 
+@pytest.mark.slow
 def test_readings_that_err_for_a_while_are_no_heavy_tails():
     louder = np.ones((2, 800))
     louder[1, 300:360] = 8.0

@@ -281,6 +281,7 @@ def test_a_users_own_effect():
     assert within(found.findings[0], CoilRubbing(strength=4.0))
 
 
+@pytest.mark.slow
 def test_two_workers_find_the_same(tmp_path):
     loop = levitation()
     real = loop.with_effect(E.ViscousFriction(c=3.0))

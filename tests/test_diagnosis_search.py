@@ -436,6 +436,7 @@ def test_a_replica_is_fitted_from_its_own_trajectory():
         assert copy.fit.value > model.fit.value - 300
 
 
+@pytest.mark.slow
 def test_units_of_the_record_that_are_not_those_of_the_plant_are_told():
     loop = drive()
     record = record_of(loop, E.CoulombFriction(2.0), 0.3, 1e-4, 9850, n=300)
@@ -786,6 +787,7 @@ class FreshStub:
         return 0.0 if self.measure_model_gap(one) < self.measure_model_gap(other) else 1.0
 
 
+@pytest.mark.slow
 def test_the_rival_that_fresh_data_like_takes_the_place_of_a_harmful_name(two_found):
     rivals = {t.name for step in two_found.steps for t in step.trials if t.net_gain > 5}
     rivals -= {"CoulombFriction", "LinearStiffness"}
@@ -800,6 +802,7 @@ def test_the_rival_that_fresh_data_like_takes_the_place_of_a_harmful_name(two_fo
     assert other not in {f.trial.name for f in kept.found}
 
 
+@pytest.mark.slow
 def test_the_name_without_which_the_gap_is_narrowest_goes_first(two_found):
     names = {f.trial.name for f in two_found.found}
     assert names == {"CoulombFriction", "LinearStiffness"}
@@ -868,6 +871,7 @@ def test_a_model_that_was_kept_for_a_comparison_alone_can_be_carried_on(two_foun
     assert np.isfinite(screen_at(last.base, E.LinearStiffness(1.0)).score)
 
 
+@pytest.mark.slow
 def test_a_search_ends_with_the_likeliest_state_it_passed_through(monkeypatch):
     loop = replace(drive(), controller=None)
     real = drive().with_effect(E.CoulombFriction(0.3)).with_effect(E.LinearStiffness(20.0))
@@ -1223,6 +1227,7 @@ def test_a_climb_from_noise_that_loses_the_record_is_an_answer():
     assert not maximize(lost, rounds=3, exact=False).value > -float("inf")
 
 
+@pytest.mark.slow
 def test_a_gap_is_that_of_the_friction_which_was_found():
     """Linearized along its last trajectory, a filter with a stick and hardly any force was lost."""
     plant = ct.nlsys(

@@ -97,6 +97,7 @@ def test_a_replica_without_a_controller_is_like_the_record(fc, monkeypatch):
     assert run_noise_tests(make_replica(model).fit).passed
 
 
+@pytest.mark.slow
 def test_friction_in_the_model_is_given_no_companion():
     """What the filter does wrong with sharp friction had been an actuator's lag."""
     loop = rubbing(1.0)
@@ -105,6 +106,7 @@ def test_friction_in_the_model_is_given_no_companion():
     assert (found.verdict, found.findings) == ("nothing missing", ())
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_found_beside_friction_all_the_same():
     loop = rubbing(1.0)
     record = record_of(loop.with_effect(E.ActuatorLag(tau=0.002)), 3)

@@ -104,6 +104,7 @@ def test_the_waves_that_are_looked_at_closely_hold_the_best_of_all(period, n):
     assert 1 / trial.effect.period == pytest.approx(numbers[np.argmax(gains)], rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "named"), [(0.75, False), (0.25, True)])
 def test_a_wave_that_the_motion_spans_once_is_no_ripple(share, named):
     # A longer period on the same way is any smooth curve of the position, as of a magnet.

@@ -109,6 +109,7 @@ def make_tanks(rng, n=300):
                        cases.WHITE, np.ones(1), np.ones(1), free, 1.0, u, y)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_worth_is_the_smallest_where_free_parameters_nearly_are_one():
     """Against a search that needs no slopes, from where the climb ended and from elsewhere."""
     truth, without = make_tanks(np.random.default_rng(4)), plants.make_neutral()

@@ -313,6 +313,7 @@ def test_a_right_name_whose_simulation_diverges_stays():
     assert "diverges on the samples kept back" in found.notes[-1]
 
 
+@pytest.mark.slow
 def test_a_simulation_that_the_last_digits_decide_takes_no_name_back():
     """Cogging strong enough to hold a mass anywhere: which of many places it stops at is chance."""
     few = [E.PositionRipple, E.CoulombFriction]

@@ -108,6 +108,7 @@ def test_the_answer_so_far(record, tmp_path):
     assert "UNKNOWN SO FAR. THE SEARCH WAS NOT FINISHED" in " ".join(str(again).split())
 
 
+@pytest.mark.slow
 def test_what_was_found_before_the_end_is_kept(monkeypatch):
     """Stopped in the second round, the effect of the first one is named, and nothing is claimed."""
     real = drive().with_effect(E.CubicStiffness(300.0)).with_effect(E.InputOffset(0.8))

@@ -147,6 +147,7 @@ def test_an_output_that_does_not_move_is_the_headline():
     assert (found.verdict, found.findings, found.stand_ins) == ("unknown", (), ())
 
 
+@pytest.mark.slow
 def test_a_repair_after_which_the_input_does_nothing_is_none():
     """A random force explains any record that wanders, in any unit."""
     rng = np.random.default_rng(12)

@@ -108,6 +108,7 @@ def test_the_order_of_coloured_noise_is_found_and_white_stays_white(b, a, orders
     assert np.abs(error).max() < 4
 
 
+@pytest.mark.slow
 def test_a_coloured_force_and_a_colour_of_the_sensor_are_found_beside_each_other():
     """Gusts on a plant whose sensor errs alike in successive readings."""
     loop, record, noise = make_loop_and_record([1.0], [1.0, -0.5], n=3000, seed=9)

@@ -46,6 +46,7 @@ def test_the_same_effect_in_two_sizes():
     assert finding.effect.fc == pytest.approx(0.6, abs=5 * finding.standard_errors["fc"])
 
 
+@pytest.mark.slow
 def test_a_parameter_that_changed_between_the_records():
     loop = drive()
     # What is wrongly blamed shows in a longer record.

@@ -130,6 +130,7 @@ def test_a_filter_finds_its_way_where_friction_is_abrupt(sharpened):
     assert loop.parameters["CoulombFriction.fc"] == pytest.approx(FRICTION, rel=0.01)
 
 
+@pytest.mark.slow
 def test_dry_friction_alone_is_named_alone():
     record = log_carriage(3, n=500, noise=1e-4)
     few = [E.CoulombFriction, E.AsymmetricCoulombFriction, E.StribeckFriction, E.ViscousFriction]

@@ -81,6 +81,7 @@ def test_a_log_in_degrees_and_per_cent_is_told_in_them(found_in_degrees):
     assert not any("units: " in remark for remark in found.audit)
 
 
+@pytest.mark.slow
 def test_forces_need_a_length_and_one_mass_in_kilograms(degrees, found_in_degrees, tmp_path):
     _, record = degrees
     size = found_in_degrees.findings[0].effect.fc
