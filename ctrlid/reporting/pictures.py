@@ -208,7 +208,8 @@ def make_ranking(found: Diagnosis) -> dict[str, list[Bar]]:
             taken = max(earned, key=lambda c: (c.taken, c.round))
             stands = finding in found.findings
             kinds[id(taken)] = "found" if stands else "in the model, but its name does not stand"
-            evidence[id(taken)] = finding.evidence
+            # The evidence of all records together is that of none of them.
+            evidence[id(taken)] = math.nan if record else finding.evidence
             for c in found.ranking:
                 alike = (
                     name_with_subject(c.effect) in others
