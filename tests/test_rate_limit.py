@@ -12,9 +12,6 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.recalibration import fit_base_model
-from ctrlid.diagnosis.refitting import refit_candidate
-from ctrlid.diagnosis.scans import scan_candidate
 from ctrlid.estimation.likelihood.input_memory import find_input_range
 from ctrlid.loop.simulation import Simulator
 from problems import levitation
@@ -75,7 +72,6 @@ SOME = (E.InputRateLimit, E.ActuatorLag, E.InputDelay, E.InputSaturation, E.Inpu
     ("seed", "rate", "before", "catalogue"),
     [
         (1, 60.0, 0, SOME),
-        (13, 1500.0, 0, SOME),
         pytest.param(2, 60.0, 700, E.CATALOGUE, marks=pytest.mark.slow),
         pytest.param(7, 150.0, 0, E.CATALOGUE, marks=pytest.mark.slow),
         pytest.param(8, 150.0, 350, E.CATALOGUE, marks=pytest.mark.slow),
@@ -93,18 +89,6 @@ def test_a_servo_of_limited_speed_is_named_alone_and_its_speed_is_found(
     assert finding.effect.rate == pytest.approx(rate, rel=0.01)
     assert abs(finding.effect.rate - rate) < 4 * finding.standard_errors["rate"]
     assert found.gap.after < 1.3 * found.gap.floor
-
-
-@pytest.mark.parametrize("rate", [30.0, 3000.0])
-def test_a_limit_far_below_and_near_the_fastest_steps_is_come_near_to(rate):
-    """Where a scan ended a third beside the limit, a lag or a delay took its place."""
-    record = record_servo(12, rate)
-    steps = np.abs(np.diff(record.u)) / DT
-    assert 0.5 * steps.max() < rate or 100 * rate < steps.max()
-    base = fit_base_model(make_loop(), [record], ("a", "b"))
-    near = scan_candidate(base, E.InputRateLimit(rate=1e5))
-    assert near.score > 0
-    assert refit_candidate(base, near).fitted.rate == pytest.approx(rate, rel=0.02)
 
 
 def test_a_servo_without_a_limit_has_none():

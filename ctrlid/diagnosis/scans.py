@@ -197,7 +197,7 @@ def _find_best_place(model: Model, effect: AbstractEffect) -> Trial:
     if len(scan.starts) == len(scan.starts[0]) == 1:
         best = screen_candidate(model, scan.starts[0][0], penalty)
     else:
-        tried = (screen_starts(model, group, penalty, scan.ordered) for group in scan.starts)
+        tried = (screen_starts(model, group, penalty) for group in scan.starts)
         best = max(tried, key=lambda t: t.score)
         if not best.score > 0:
             # What is fainter than the first may promise something all the same.

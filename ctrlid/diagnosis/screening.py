@@ -97,20 +97,14 @@ def compute_score(base: Model, fit: Fit) -> float:
     return fit.value - base.fit.value + compute_expected_gain(fit)
 
 
-def screen_starts(
-    base: Model, effects: Sequence[AbstractEffect], scan_penalty: float, ordered: bool = False
-) -> Trial:
-    """Try effects that differ in their values only, and return the one with the largest score.
-
-    Between those that are in the order of a size, the best size is looked for more closely.
-    """
-    first = screen_at(base, effects[0], scan_penalty)
-    if first.out is not None:
-        return first
-    label, loop, names = first.label, first.model.loop, first.model.names
+def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: float) -> Trial:
+    """Try effects that differ in their values only, and return the one with the largest score."""
+    best = screen_at(base, effects[0], scan_penalty)
+    if best.out is not None:
+        return best
+    label, loop, names = best.label, best.model.loop, best.model.names
     start = carry_over_fit(base, loop, names)
-
-    def screen(effect: AbstractEffect) -> Trial:
+    for effect in effects[1:]:
         theta = start.theta.copy()
         for field, value in effect.values().items():
             # A parameter that the model's own parameters duplicate is not free.
@@ -121,23 +115,7 @@ def screen_starts(
         for _ in range(2):
             fit = evaluate_likelihood(start.problem, theta, start.noise, fit.trajectories)
         score = compute_score(base, fit)
-        there = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
-        return Trial(effect, label, Model(there, drop_arrays(fit)), score, scan_penalty)
-
-    tried = [first, *(screen(effect) for effect in effects[1:])]
-    for _ in range(THRESHOLD.closer_looks if ordered else 0):
-        k = max(range(len(tried)), key=lambda i: tried[i].score)
-        # The later one first, so that the places of the earlier ones stay.
-        for i in (k + 1, k):
-            if 0 < i < len(tried):
-                between = _find_middle(tried[i - 1].effect, tried[i].effect)
-                tried.insert(i, screen(between))
-    return max(tried, key=lambda t: t.score)
-
-
-def _find_middle(one: AbstractEffect, other: AbstractEffect) -> AbstractEffect:
-    """Return the effect whose sizes are the geometric means of those of two others."""
-    sizes = {}
-    for (name, v), w in zip(one.values().items(), other.values().values(), strict=True):
-        sizes[name] = math.copysign(math.sqrt(v * w), v) if v * w > 0 else (v + w) / 2
-    return replace(one, **sizes)
+        if score > best.score:
+            there = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
+            best = Trial(effect, label, Model(there, drop_arrays(fit)), score, scan_penalty)
+    return best

@@ -177,10 +177,6 @@ class Thresholds:
     fainter: float = declare_number(
         0.1, cost="by that an effect is made fainter", unit="of its size"
     )
-    closer_looks: int = declare_number(
-        2, cost="how often a scan along one size halves the ratio of the steps about the best one",
-        unit="times",
-    )  # fmt: skip
     scan_block: int = declare_number(500_000, cost="shapes are scanned in blocks", unit="numbers")
 
     # Step 5: refit.

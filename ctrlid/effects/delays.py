@@ -190,10 +190,8 @@ class InputBacklash(MemoryEffect):
         return InputMemory(memory, u, period, at_rest, after, after, u, half)
 
 
-# A largest speed is looked for from so many times the fastest step of the input on, which is then
-# an eighth of a period late, down to the speed that takes so many periods for what u moves between
-# these shares of its values, kicks of a derivative left out, and at each factor of two between.
-FASTEST, SLOWEST, USUAL = 4.0, 100.0, (0.05, 0.95)
+# A largest speed is looked for where it holds back all but these shares of the steps of the input.
+REACHED = (0.999, 0.99, 0.95, 0.8, 0.5)
 
 
 @final
@@ -246,7 +244,7 @@ class InputRateLimit(MemoryEffect):
         if not rates:
             return None
         starts = tuple(dataclasses.replace(self, rate=rate) for rate in rates)
-        return Scan((starts,), places=len(starts), ordered=True)
+        return Scan((starts,), places=len(starts))
 
     def remember(self, memory: Any, u: Any, period: Any, at_rest: Any) -> InputMemory:
         """Return the way at the largest speed; where a record begins, it may be under way."""
@@ -264,9 +262,6 @@ class InputRateLimit(MemoryEffect):
 def _find_rates(u: Any, dt: float) -> list[float]:
     """Return speeds that hold back few or many of the steps of an input, the fastest first."""
     steps = np.abs(np.diff(u))
-    if not steps.any():
+    if not steps.size:
         return []
-    moved = float(np.ptp(np.quantile(u, USUAL))) or float(np.ptp(u))
-    fastest, slowest = FASTEST * float(steps.max()) / dt, moved / (SLOWEST * dt)
-    count = max(math.floor(math.log2(fastest / slowest)), 0)
-    return [fastest / 2**k for k in range(count + 1)]
+    return [float(step) / dt for step in np.quantile(steps, REACHED) if step > 0]

@@ -144,16 +144,12 @@ class Scan:
         Starts whose score is nearly as large, which only a refit tells apart.
     remark : str
         Why the record cannot show the effect.
-    ordered : bool
-        Whether the starts of a group are in the order of one size, with one best size among them:
-        sizes between the best and its neighbours are then screened, too.
     """
 
     starts: tuple[tuple[AbstractEffect, ...], ...]
     places: float = 1.0
     others: tuple[AbstractEffect, ...] = ()
     remark: str = ""
-    ordered: bool = False
 
 
 def choose_middle_frequency(loop: Any, record: Any) -> float:
