@@ -66,7 +66,7 @@ from ctrlid.diagnosis.thresholds import THRESHOLD, vary_numbers
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
 # Numbers that may be varied: a run with another value is another run.
-NUMBERS = {t.name for t in THRESHOLD.table()}
+NUMBERS = {t.name: t.value for t in THRESHOLD.table()}
 KINDS = ("named", "none", "outside", "two", "three", "lookalike", "inside")
 WORTH = {"faint": (50.0, 300.0), "moderate": (300.0, 3e3), "ordinary": (3e3, 3e4)}
 TRIES = 40  # draws until one can carry an effect of the wanted worth
@@ -951,23 +951,22 @@ def parse_vary(text: str) -> list[dict[str, float]]:
     [{'gate': 5.0}, {'gate': 4.0}, {'gate': 6.0}]
     """
     name, _, values = text.partition("=")
-    known = {t.name: t.value for t in THRESHOLD.table()}
-    if isinstance(known.get(name), tuple):
-        raise argparse.ArgumentTypeError(f"{name} is several numbers, which cannot be varied")
-    if name not in known:
-        near = difflib.get_close_matches(name, known, 3)
+    if isinstance(NUMBERS.get(name), tuple):
+        raise argparse.ArgumentTypeError(f"needs a single number; {name} is several")
+    if name not in NUMBERS:
+        near = difflib.get_close_matches(name, NUMBERS, 3)
         raise argparse.ArgumentTypeError(
             f"needs a number of ctrlid/diagnosis/thresholds.py; given {name!r}. Alike are "
             f"{', '.join(near) or 'none'}"
         )
-    kind = type(known[name])
+    kind = type(NUMBERS[name])
     try:
         others = [kind(v) for v in values.split(",")]
     except ValueError:
         raise argparse.ArgumentTypeError(
-            f"needs values such as {name}={known[name]:g},{2 * known[name]:g}; given {text!r}"
+            f"needs values such as {name}={NUMBERS[name]:g},{2 * NUMBERS[name]:g}; given {text!r}"
         ) from None
-    return [{name: v} for v in (known[name], *others)]
+    return [{name: v} for v in (NUMBERS[name], *others)]
 
 
 def main() -> None:

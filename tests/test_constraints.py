@@ -25,7 +25,8 @@ from ctrlid.estimation.constraints.branches import (
     is_possible,
     list_cases,
 )
-from ctrlid.estimation.identified_model import Structure, compute_root_errors
+from ctrlid.estimation.identified_model import Structure
+from ctrlid.estimation.root_errors import compute_root_errors
 
 Z2, Z3 = Structure(2, 2), Structure(3, 2)
 S2, S3 = Structure(2, 1, domain="s"), Structure(3, 1, domain="s")

@@ -668,10 +668,8 @@ class Record(Printed):
         labels = [name if name == key or name.startswith(tuple(numbered)) else f"{key} ({name})"
                   for key, name, *_ in channels]  # fmt: skip
         width = max(map(len, labels))
-        for label, (_, _, unit, every, counts) in zip(labels, channels, strict=True):
-            # What does not count, such as a dropout, says nothing of the range.
-            values = every[counts] if counts.any() else every
-            rows.append(f"  {label:<{width}}  {values.min():.6g} .. {values.max():.6g} "
+        for label, (_, _, unit, _, counted) in zip(labels, channels, strict=True):
+            rows.append(f"  {label:<{width}}  {counted.min():.6g} .. {counted.max():.6g} "
                         f"{'' if unit == '1' else unit}".rstrip())  # fmt: skip
         return "\n".join(rows)
 
@@ -703,7 +701,7 @@ def _write_no_instants(t: Any) -> str:
 def list_rows(record: Record) -> list[tuple[str, str, str, Any, Any]]:
     """Return what a record has, signal by signal and channel by channel.
 
-    Each row is key, name, unit, samples, and which of the samples count.
+    Each row is key, name, unit, samples, and those of the samples that count.
     """
     rows: list[tuple[str, str, str, Any, Any]] = []
     counts = record.valid_somewhere
@@ -711,8 +709,20 @@ def list_rows(record: Record) -> list[tuple[str, str, str, Any, Any]]:
         units = list_signals(key, record.units.get(key, ("",) * len(names)), len(names))
         each = np.reshape(getattr(record, key), (-1, len(record)))
         own = record.valid_outputs if key == "y" else (counts,) * len(names)
-        rows += [(key, *row) for row in zip(names, units, each, own, strict=True)]
-    return [*rows, *((k, k, record.units.get(k, ""), v, counts) for k, v in record.extra.items())]
+        kept = [keep_counted(v, use) for v, use in zip(each, own, strict=True)]
+        rows += [(key, *row) for row in zip(names, units, each, kept, strict=True)]
+    for key, values in record.extra.items():
+        kept = keep_counted(values, counts)
+        rows.append((key, key, record.units.get(key, ""), values, kept))
+    return rows
+
+
+def keep_counted(values: Any, counts: Any) -> Any:
+    """Return the samples that count, or all where none does.
+
+    What does not count, such as a dropout, says nothing of ranges and scales.
+    """
+    return values[counts] if counts.any() else values
 
 
 def _rebuild(fields: dict[str, Any]) -> Record:

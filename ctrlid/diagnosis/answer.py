@@ -12,7 +12,7 @@ from .._base.text import write_count, write_quantity
 from .._base.units import fill_unit
 from ..data.record import Record
 from ..effects import AbstractEffect, Quantization, equivalents
-from ..effects.base import name_with_subject
+from ..effects.base import find_own_module, name_with_subject
 from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.physics_estimate import is_unseen
@@ -286,8 +286,7 @@ def _list_untried(found: Search) -> list[str]:
     """Say of effects of the user's own that could not be tried, and why not."""
     said: dict[str, str] = {}
     for t in (t for step in found.steps for t in step.trials):
-        own = not type(t.effect).__module__.startswith("ctrlid.")
-        if own and t.out is not None and t.out.ground == "cannot run":
+        if find_own_module(t.effect) and t.out is not None and t.out.ground == "cannot run":
             said.setdefault(t.effect.called, t.out.words)
     return [f"{name} could not be tried: {words}" for name, words in said.items()]
 

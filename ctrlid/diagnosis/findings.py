@@ -125,11 +125,15 @@ class Gap(Printed):
         """RMS error of the recalibrated model, whether or not it is the smaller [output unit]."""
         return self.before if math.isnan(self.recalibrated) else self.recalibrated
 
-    def __str__(self) -> str:
+    @property
+    def written_sizes(self) -> str:
+        """The RMS errors before and with the effects, and that of noise alone, in words."""
         sizes = [write_quantity(size, self.unit) for size in (self.before, self.after, self.floor)]
-        text = (f"gap of the {self.name}{f' of {self.output}' if self.output else ''}: RMS error "
-                f"{sizes[0]} before, {sizes[1]} with the effects, {sizes[2]} from noise "
-                "alone")  # fmt: skip
+        return f"{sizes[0]} before, {sizes[1]} with the effects, {sizes[2]} from noise alone"
+
+    def __str__(self) -> str:
+        of = f" of {self.output}" if self.output else ""
+        text = f"gap of the {self.name}{of}: RMS error {self.written_sizes}"
         return "\n".join([text, *(f"  {one}" for one in self.outputs)])
 
 

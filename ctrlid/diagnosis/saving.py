@@ -15,7 +15,7 @@ import numpy as np
 from .._base.errors import CtrlidError
 from .._base.files import replace_file
 from ..effects import AbstractEffect
-from ..effects.base import name_at_place, name_with_subject
+from ..effects.base import find_own_module, name_at_place, name_with_subject
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
 
@@ -128,8 +128,8 @@ def _encode(value: Any) -> Any:
             number = float(value)
             return number if math.isfinite(number) else str(number)
         case AbstractEffect():
-            own = {} if type(value).__module__.startswith("ctrlid.") else {
-                "module": type(value).__module__}  # fmt: skip
+            module = find_own_module(value)
+            own = {"module": module} if module else {}
             # An effect of a plant with one place has no place to name, nor a value out of use.
             fields = {f.name: _encode(getattr(value, f.name)) for f in dataclasses.fields(value)
                       if (f.name != "at" or value.at)

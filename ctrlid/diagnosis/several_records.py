@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from .._base.text import with_error, write_list, write_number, write_quantity
+from .._base.text import with_error, write_list, write_number
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from .candidates import is_same_kind
@@ -57,7 +57,7 @@ def merge_diagnoses(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
         "error is, the curves of the picture, the sensor noise and the random force are those of "
         f"record {parts.index(lead) + 1}"
     )
-    others = [f"that of record {k + 1} is the RMS error {_write_gap(p.gap)}"
+    others = [f"that of record {k + 1} is the RMS error of the {p.gap.name}, {p.gap.written_sizes}"
               for k, p in enumerate(parts) if k not in alike]  # fmt: skip
     if others:
         notes.append(
@@ -116,8 +116,7 @@ def describe_presence(seen: Sequence[int], records: int) -> str:
         return "seen in every record"
     if not seen:
         return "seen in no record alone"
-    which = write_list([str(k + 1) for k in seen])
-    return f"seen in record{'s' if len(seen) > 1 else ''} {which} of {records} only"
+    return f"seen in {_name_records(seen, records)} of {records} only"
 
 
 def _write_values(effect: AbstractEffect) -> str:
@@ -226,9 +225,3 @@ def _name_records(numbers: Sequence[int], records: int) -> str:
     if len(numbers) == records:
         return "all records"
     return f"record{'s' if len(numbers) > 1 else ''} {write_list([str(k + 1) for k in numbers])}"
-
-
-def _write_gap(gap: Gap) -> str:
-    sizes = [write_quantity(v, gap.unit) for v in (gap.before, gap.after, gap.floor)]
-    return (f"of the {gap.name}, {sizes[0]} before, {sizes[1]} with the effects and {sizes[2]} "
-            "from noise alone")  # fmt: skip

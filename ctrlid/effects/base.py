@@ -451,6 +451,12 @@ def name_at_place(effect: AbstractEffect) -> str:
     return f"{effect.called} at {effect.at}" if effect.at else effect.called
 
 
+def find_own_module(effect: AbstractEffect) -> str:
+    """Return the module of an effect that a user wrote; empty for one of ctrlid."""
+    module = type(effect).__module__
+    return "" if module.startswith("ctrlid.") else module
+
+
 def name_with_subject(effect: AbstractEffect) -> str:
     """Return what a report calls an effect: its name, of which parameter or state, and its place.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -18,6 +17,7 @@ from .._base.arguments import check_arguments
 from .._base.arrays import Array, ComplexArray, read_only
 from .._base.errors import CtrlidError
 from ..physics.conversions import reduce_states, to_transfer_function
+from .root_errors import RESOLVED, compute_root_errors, find_coincident
 
 # Fewer states stand for a model whose frequency response they change by at most this share.
 NEAR = 0.2
@@ -310,77 +310,9 @@ class Estimate(_text.Printed):
         return _write_report(self)
 
 
-# Roots nearer to each other, relative to their size, cannot be told from multiple ones: rounding of
-# the coefficients parts a double root by the square root of the machine's precision.
-RESOLVED = 8 * math.sqrt(np.finfo(float).eps)
-# A share of the terms of a sum that is rounding beside a double root.
-PARTED = 1e-6
-
-
 def _are_at_zero(poles: Any) -> Any:
     """Tell which poles in z are at zero; they are found as differences from one."""
     return np.abs(poles) < 8 * np.finfo(float).eps
-
-
-def compute_root_errors(roots: ComplexArray, covariance: Array) -> Array:
-    """Return the standard errors of the roots of a monic polynomial, by the delta method.
-
-    Parameters
-    ----------
-    roots : (n,) array
-        Its roots.
-    covariance : (n, n) array
-        Covariance of its coefficients after the leading 1, in falling powers.
-
-    Returns
-    -------
-    (n,) array
-        Standard errors; of roots that coincide that of their mean where the coefficients can only
-        move so that they go on to coincide, and else infinite.
-    """
-    n = len(roots)
-    if not covariance.any():
-        return np.zeros(n)
-    powers, spread = np.arange(n - 1, -1, -1), np.sqrt(np.diag(covariance))
-    errors = np.empty(n)
-    for k in range(n):
-        alike = np.abs(roots - roots[k]) <= RESOLVED * np.maximum(np.abs(roots), np.abs(roots[k]))
-        if alike.sum() == 1:
-            gradient = -(roots[k] ** powers) / np.prod(roots[k] - np.delete(roots, k))
-            errors[k] = _compute_spread(gradient, covariance)
-            continue
-        # At a multiple root a change of the polynomial's value there parts the roots.
-        apart = roots[alike].mean() ** powers
-        if _compute_spread(apart, covariance) > PARTED * (np.abs(apart) @ spread):
-            errors[k] = np.inf
-            continue
-        gradient = _differentiate_mean(roots, alike)
-        error = _compute_spread(gradient, covariance)
-        errors[k] = error if error > PARTED * (np.abs(gradient) @ spread) else 0.0
-    return errors
-
-
-def _compute_spread(gradient: ComplexArray, covariance: Array) -> float:
-    return math.sqrt(max(float((gradient.conj() @ covariance @ gradient).real), 0.0))
-
-
-def _differentiate_mean(roots: ComplexArray, alike: Any) -> ComplexArray:
-    r"""Return the derivatives of the mean of some roots that coincide by the coefficients.
-
-    .. math:: \frac{\partial}{\partial a_j} \sum_i z_i
-        = -\frac{1}{2 \pi i} \oint \frac{z^{n-j}}{A(z)} \, dz
-
-    around them alone, by the trapezoidal rule, which converges geometrically on a circle.
-    """
-    n, center = len(roots), roots[alike].mean()
-    far = np.abs(roots[~alike] - center)
-    radius = 0.5 * (float(far.min()) if far.size else max(abs(center), 1.0))
-    turn = np.exp(2j * np.pi * (np.arange(64) + 0.5) / 64)
-    z = center + radius * turn
-    value = np.prod(z[:, None] - roots, axis=1)
-    each = z[:, None] ** np.arange(n - 1, -1, -1) * (radius * turn / value)[:, None]
-    gradient: ComplexArray = -each.mean(axis=0) / np.count_nonzero(alike)
-    return gradient
 
 
 def _write_report(e: Estimate) -> str:
@@ -437,9 +369,9 @@ def _list_bad_news(e: Estimate) -> list[str]:
     ]
     news += merged
     # A merged pair at the edge is known to half the digits only.
-    twice = [np.sum(np.abs(z - one) <= RESOLVED * abs(one)) > 1 for one in z]
-    edge_of = np.where(twice, RESOLVED, 1e-9)
-    unstable = np.abs(z) > 1 + edge_of if e.structure.domain == "z" else z.real > 0
+    twice = np.array([np.count_nonzero(find_coincident(z, one)) > 1 for one in z], dtype=bool)
+    edges = 1 + np.where(twice, RESOLVED, 1e-9)
+    unstable = np.abs(z) > edges if e.structure.domain == "z" else z.real > 0
     if not unstable.any():
         edge = "outside the unit circle" if e.structure.domain == "z" else "in the right half plane"
         if any(bound.unstable for bound in e.active_bounds):

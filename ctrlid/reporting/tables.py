@@ -156,11 +156,10 @@ def make_blocks(result: Any) -> list[Block]:
 
 
 def _make_record_table(record: Record) -> Table:
-    rows = []
-    for _, name, unit, every, counts in list_rows(record):
-        values = every[counts] if counts.any() else every
-        numbers = (f"{f(values):.6g}" for f in (np.min, np.mean, np.max, np.std))
-        rows.append((name, unit or "not given", *numbers))
+    rows = tuple(
+        (name, unit or "not given", *(f"{f(v):.6g}" for f in (np.min, np.mean, np.max, np.std)))
+        for _, name, unit, _, v in list_rows(record)
+    )
     share = f"{100 * record.valid.mean():.1f} %"
     valid = "" if record.valid.all() else f", {share} of them valid, whose numbers are these"
     between = BETWEEN[record.hold]
@@ -170,7 +169,7 @@ def _make_record_table(record: Record) -> Table:
         f"u {between} between samples."
     )
     head = ("signal", "unit", "smallest", "mean", "largest", "standard deviation")
-    return Table(head, tuple(rows), caption)
+    return Table(head, rows, caption)
 
 
 def _make_audit_blocks(found: Audit) -> list[Block]:

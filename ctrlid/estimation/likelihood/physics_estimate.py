@@ -23,7 +23,7 @@ from ..._base.text import (
 )
 from ...loop.loop import Loop, write_loop
 from ...physics.linearization import make_state_space, operating_point
-from ..identified_model import compute_root_errors
+from ..root_errors import compute_root_errors
 
 # A direction of which the scaled information has a smaller relative eigenvalue is not in the data.
 UNSEEN = 1e-9

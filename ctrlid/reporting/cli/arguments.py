@@ -71,10 +71,11 @@ def read_loop(args: argparse.Namespace, record: Record) -> Loop:
         _require_known(args.model, list(model.parameters), [*values, *free])
         return dataclasses.replace(model.with_parameters(values), free=free)
     free = PLANTS.get(args.model, ()) if args.free is None else _join_names(args.free)
-    _require_known(args.model, list(trace(model).parameters), [*values, *free])
+    traced = trace(model)
+    _require_known(args.model, list(traced.parameters), [*values, *free])
     model = with_parameters(model, values) if values else model
-    output = _take_values("--at-output", args.at_output, trace(model).outputs)
-    bias = _take_values("--input-bias", args.input_bias, trace(model).inputs)
+    output = _take_values("--at-output", args.at_output, traced.outputs)
+    bias = _take_values("--input-bias", args.input_bias, traced.inputs)
     means = _take_means(record, "y", record.valid_outputs)
     # A linear model acts on deviations from the means of the record.
     if isinstance(model, ct.TransferFunction | ct.StateSpace):

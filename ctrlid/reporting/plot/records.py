@@ -9,7 +9,7 @@ from ..._base import text as _text
 from ..._base.arguments import explain_names
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
-from ...data.record import Record, list_rows
+from ...data.record import Record, keep_counted, list_rows
 from ...data.validity import find_runs
 from ...validation.comparison import Comparison, write_fit
 from .. import pictures as _pictures
@@ -83,26 +83,26 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
     followed = [_find_reference(references, k, row, len(outputs)) for k, row in enumerate(outputs)]
     alone = [row for row in references if all(row is not one for one in followed)]
     axes = take_axes(ax, len(outputs) + len(alone) + len(inputs) + len(extra), sharex=True)
-    for ax, (name, unit, values, counts), wanted in zip(axes, outputs, followed, strict=False):
-        both = [_keep(values, counts)] + ([] if wanted is None else [_keep(*wanted[2:])])
+    for ax, (name, unit, values, counted), wanted in zip(axes, outputs, followed, strict=False):
+        both = [counted] if wanted is None else [counted, wanted[3]]
         scale, unit = _pictures.choose_scale(both, unit)
         _draw_trace(ax, record, scale * values, 0, f"measured {name}")
         if wanted is not None:
             label = wanted[0] if wanted[0] != "r" else ""
             _draw_trace(ax, record, scale * wanted[2], 1, f"reference {label}", True)
         ax.set_ylabel(f"{name} [{unit}]")
-        _view_counted(ax, [scale * kept for kept in both])
+        _view_counted(ax, scale * np.concatenate(both))
     panels = [(1, "reference ", True, row) for row in alone]
     panels += [(2 + i, "input ", record.hold == "zoh", row) for i, row in enumerate(inputs)]
     channels = {row[0]: row[1:] for row in rows if row[0] in record.extra}
     panels += [(2 + len(inputs) + i, "", False, channels[k]) for i, k in enumerate(extra)]
-    for ax, (colour, kind, held, (name, unit, values, counts)) in zip(
+    for ax, (colour, kind, held, (name, unit, values, counted)) in zip(
         axes[len(outputs) :], panels, strict=True
     ):
-        scale, unit = _pictures.choose_scale([_keep(values, counts)], unit)
+        scale, unit = _pictures.choose_scale([counted], unit)
         _draw_trace(ax, record, scale * values, colour % len(COLOURS), f"{kind}{name}", held)
         ax.set_ylabel(f"{name} [{unit}]")
-        _view_counted(ax, [scale * _keep(values, counts)])
+        _view_counted(ax, scale * counted)
     for ax in axes:
         _shade_gaps(ax, record)
         finish_axes(ax)
@@ -122,14 +122,9 @@ def _find_reference(references: Any, k: int, output: Any, outputs: int) -> Any:
     return next((row for row in alike if not unit or not row[1] or row[1] == unit), None)
 
 
-def _keep(values: Array, counts: Array) -> Array:
-    """Return the samples that count, or all where none does."""
-    return values[counts] if counts.any() else values
-
-
-def _view_counted(ax: Any, counted: Sequence[Array]) -> None:
+def _view_counted(ax: Any, counted: Array) -> None:
     """Keep what counts readable wherever samples go that do not."""
-    low, high = min(v.min() for v in counted), max(v.max() for v in counted)
+    low, high = counted.min(), counted.max()
     margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
     bottom, top = ax.get_ylim()
     if bottom < low - 2 * margin or top > high + 2 * margin:
@@ -198,7 +193,7 @@ def _draw_curves(ax: Any, comparison: Comparison, shown: slice) -> None:
     """Draw the measured output and what is made of it, in the samples shown."""
     whole = comparison.record
     t = whole.t[shown]
-    counted = _keep(whole.y[shown], whole.valid[shown])
+    counted = keep_counted(whole.y[shown], whole.valid[shown])
     scale, unit = _pictures.choose_scale([counted], whole.units.get("y", ""))
     y = scale * whole.y[shown]
     ax.plot(t, y, label=f"measured {whole.names.get('y', 'y')}", **MEASURED)
